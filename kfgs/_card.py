@@ -26,16 +26,8 @@ def html_card(title: str, facts: Mapping[str, object]) -> str:
 def short_repr(thing: Any) -> str:
     """A line for `__repr__` of a dataclass or a named tuple: its fields, tensors by shape and type only; at most `LINE` long.
 
-    Fields that are None, and fields declared with `repr=False`, are left out.
-
-    Example:
-        >>> import torch
-        >>> from typing import NamedTuple
-        >>> class Nearest(NamedTuple):
-        ...     codeword: torch.Tensor
-        ...     exact: bool
-        >>> short_repr(Nearest(torch.zeros(5, 3), True))
-        'Nearest(codeword=[5, 3] float32, exact=True)'
+    For instance `Nearest(codeword=[5, 3] int64, similarity=[5, 3] float32)`. Fields that are None, and fields declared with
+    `repr=False`, are left out.
     """
     names = [field.name for field in fields(thing) if field.repr] if is_dataclass(thing) else thing._fields
     values = {name: getattr(thing, name) for name in names}

@@ -66,9 +66,7 @@ def check_shapes(*arguments: tuple[str, Any, str | tuple[str | int, ...]]) -> di
             known = [f"{a} = {sizes[a]} (from {bound_by[a]})" for a in axes if isinstance(a, str) and a in sizes]
             where = f" with {', '.join(known)}" if known else ""
             raise ValueError(f"{name}: expected {expected_shape}{where}, got {shape}; pass a tensor of that shape")
-        for axis, size in zip(axes, shape, strict=True):
-            if isinstance(axis, str) and axis not in sizes:
-                sizes[axis], bound_by[axis] = size, name
+        sizes, bound_by = own | sizes, dict.fromkeys(own, name) | bound_by
     return sizes
 
 
@@ -79,30 +77,26 @@ def as_tensor(name: str, value: Any, *, floating: bool = False) -> Tensor:
     its whole numbers if `floating` numbers are required (another TypeError). The messages say what to pass instead.
     """
     if not isinstance(value, Tensor):
-        value = _from_numbers(name, value, floating)
+        if isinstance(value, np.ma.MaskedArray):
+            got = "a masked array; fill it with .filled(number)"
+            raise TypeError(f"{name}: expected numbers without a mask, got {got}")
+        is_list = isinstance(value, list | tuple | range | numbers.Real)
+        array = np.empty(0, dtype=object)
+        if is_list or hasattr(value, "__array__"):  # not our own sequences, which may read a file for each item
+            with contextlib.suppress(ValueError, TypeError, RuntimeError):  # rows of different lengths, other objects
+                array = np.asarray(value)
+        if array.dtype.kind not in "fiub":
+            advice = "pass numbers, in rows of equal length" if is_list else _instead(value)
+            raise TypeError(f"{name}: expected a tensor, got {type(value).__name__}; {advice}")
+        shared = array.flags.writeable and array.flags.aligned and array.dtype.isnative
+        if not shared or any(stride < 0 for stride in array.strides):  # torch would refuse it, or warn
+            array = np.array(array, dtype=array.dtype.newbyteorder("="))
+        value = torch.from_numpy(array)
+        if is_list and (value.is_floating_point() or (floating and value.dtype != torch.bool)):
+            value = value.to(torch.get_default_dtype())
     if floating and not value.is_floating_point():
         raise TypeError(f"{name}: expected floating-point numbers, got {value.dtype}; convert them, as with .float()")
     return value
-
-
-def _from_numbers(name: str, value: Any, floating: bool) -> Tensor:
-    """Lists, and whatever NumPy calls an array. Our own sequences, which may read a file for each item, are refused."""
-    if isinstance(value, np.ma.MaskedArray):
-        raise TypeError(f"{name}: expected numbers without a mask, got a masked array; fill it with .filled(number)")
-    is_list = isinstance(value, list | tuple | range | numbers.Real)
-    array = np.empty(0, dtype=object)
-    if is_list or hasattr(value, "__array__"):
-        with contextlib.suppress(ValueError, TypeError, RuntimeError):  # rows of different lengths, other objects
-            array = np.asarray(value)
-    if array.dtype.kind not in "fiub":
-        advice = "pass numbers, in rows of equal length" if is_list else _instead(value)
-        raise TypeError(f"{name}: expected a tensor, got {type(value).__name__}; {advice}")
-    shared = array.flags.writeable and array.flags.aligned and array.dtype.isnative
-    if not shared or any(stride < 0 for stride in array.strides):  # torch would refuse it, or warn
-        array = np.array(array, dtype=array.dtype.newbyteorder("="))
-    tensor = torch.from_numpy(array)
-    converted = is_list and (tensor.is_floating_point() or (floating and tensor.dtype != torch.bool))
-    return tensor.to(torch.get_default_dtype()) if converted else tensor
 
 
 def as_array(values: Any, name: str = "values") -> np.ndarray[Any, Any]:

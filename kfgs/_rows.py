@@ -38,12 +38,10 @@ def unit_embeddings(embeddings: Tensor, name: str = "embeddings") -> Tensor:  # 
         raise ValueError(f"{name}: expected at least one class, got {tuple(embeddings.shape)}; pass one row per class")
     lengths = row_norms(embeddings)
     check_directions(name, embeddings, lengths)
-    empty = lengths <= EPS
-    if bool(empty.any()):
-        row = int(empty.nonzero()[0])
-        length = float(embeddings[row].double().norm())
-        got = f"a length of {length:.3g}" if length else "all zeros"
-        raise ValueError(f"{name}: expected rows longer than {EPS:g}, got {got} in row {row}; drop or replace it")
+    if empty := (lengths <= EPS).nonzero()[:, 0].tolist():
+        length = float(embeddings[empty[0]].double().norm())
+        got = f"{f'a length of {length:.3g}' if length else 'all zeros'} in row {empty[0]}"
+        raise ValueError(f"{name}: expected rows longer than {EPS:g}, got {got}; drop or replace it")
     return unit_rows(embeddings.detach())
 
 

@@ -125,11 +125,7 @@ class Gaussians:
     __getitem__ = select
 
     def by_class(self) -> dict[int, Gaussians]:
-        """One cloud for each label that occurs, ascending; -1 is the cloud without a class.
-
-        Raises:
-            ValueError: if there are no labels.
-        """
+        """One cloud for each label that occurs, ascending; -1 is the cloud without a class. A ValueError without labels."""
         if self.labels is None:
             raise ValueError("gaussians: expected labels, got none; `kfgs.attach` or `transfer_labels` gives them some")
         return {label: self.select(self.labels == label) for label in self.labels.unique().tolist()}
@@ -153,8 +149,7 @@ class Gaussians:
     def cat(parts: Sequence[Gaussians]) -> Gaussians:
         """Concatenate clouds that carry the same tensors and columns; the edit `Insert` joins others.
 
-        Raises:
-            ValueError: if there is nothing to join, or one cloud carries what another lacks.
+        A ValueError if there is nothing to join, or one cloud carries what another lacks.
         """
         if not parts:
             raise ValueError("parts: expected at least one Gaussians, got none")

@@ -1,14 +1,12 @@
 """Convert points between the world, the frame of the camera and its pixels (through the lens); cameras to kornia's and back.
 
-**Convention** (COLMAP's): x right, y down, z forward; the centre of the first pixel is (0.5, 0.5). The camera's matrices
-follow the dtype and device of the points.
+The convention is `Camera`'s. The camera's matrices follow the dtype and device of the points.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import reduce
 
 import numpy as np
 import torch
@@ -178,12 +176,12 @@ def to_kornia(cameras: Sequence[Camera]) -> PinholeCamera:
     cameras = [camera.with_origin(cameras[0].origin) for camera in cameras]
     for camera in cameras:
         refuse_distortion(camera)
-    dtype = reduce(torch.promote_types, (matrix.dtype for camera in cameras for matrix in (camera.K, camera.viewmat)))
-    extrinsics = torch.stack([camera.viewmat.to(dtype) for camera in cameras])
-    intrinsics = torch.eye(4, dtype=dtype, device=extrinsics.device).repeat(len(cameras), 1, 1)
-    intrinsics[:, :3, :3] = torch.stack([camera.K.to(dtype) for camera in cameras])
-    sizes = torch.tensor([camera.size for camera in cameras], device=extrinsics.device)
-    return PinholeCamera(intrinsics, extrinsics, height=sizes[:, 0], width=sizes[:, 1])
+    viewmats, Ks = (torch.stack([getattr(camera, name) for camera in cameras]) for name in ("viewmat", "K"))
+    dtype = torch.promote_types(viewmats.dtype, Ks.dtype)
+    intrinsics = torch.eye(4, dtype=dtype, device=viewmats.device).repeat(len(cameras), 1, 1)
+    intrinsics[:, :3, :3] = Ks
+    sizes = torch.tensor([camera.size for camera in cameras], device=viewmats.device)
+    return PinholeCamera(intrinsics, viewmats.to(dtype), height=sizes[:, 0], width=sizes[:, 1])
 
 
 def from_kornia(pinhole: PinholeCamera) -> list[Camera]:
