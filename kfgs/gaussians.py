@@ -180,8 +180,8 @@ def as_rows(name: str, which: Any, count: int) -> Tensor:  # [count] bool, or [n
     if not isinstance(which, Tensor):
         numbers = isinstance(which, int | np.integer | list | tuple | range) or hasattr(which, "__array__")
         if isinstance(which, Gaussians) or not numbers:
-            got = type(which).__name__
-            raise TypeError(f"{name}: expected a mask or whole numbers, got {got}; pass a Selection, a mask or indices")
+            got = f"{type(which).__name__}; pass a Selection (OfClass('chair').select(cloud)), a mask or indices"
+            raise TypeError(f"{name}: expected a mask or whole numbers, got {got}")
         which = as_tensor(name, which)
     rows = which.long() if which.numel() == 0 and which.dtype != torch.bool else which
     if rows.dtype == torch.bool and rows.shape != (count,):

@@ -142,6 +142,8 @@ def test_14_crops(field, splat):
     assert 0 < len(inside) < len(field)
     assert len(field.select(inside)) == len(field.gaussians[inside]) == len(inside)
     assert len(splat[labelled.labels >= 0]) <= len(splat)
+    for which in ("chair", OfClass("chair"), InBox(low, high)):
+        refused(lambda which=which: splat[which], "which:", "OfClass('chair').select(cloud)", error=TypeError)
 
 
 def test_15_a_field_of_my_own_gaussians_and_features(splat):
