@@ -88,7 +88,7 @@ ERRORS = [
     ("view {field} --out {o} --where picture", ("--text: expected a table of words",)),
     ("view {run} --out {o} --where picture --weights x", ("--weights: expected --teacher with it",)),
     ("view {run} --out {o} --where picture --ask wal", ("class:", "got 'wal'")),
-    ("view {splat} --out {o} --where picture", ("SOURCE: expected a splat with classes",)),
+    ("view {splat} --out {o} --where picture --ask chair", ("words: expected a splat with classes", "kfgs attach")),
     ("view nowhere --out {o} --where picture", ("SOURCE: expected a field (RUN/field.kfgs",)),
     ("view {run} --out {o} --where picture --color {field}", ("--color: expected a splat file",)),
 ]

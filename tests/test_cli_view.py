@@ -60,3 +60,9 @@ def test_a_run_folder_brings_its_colours_and_the_photos_of_its_scene(desk, tmp_p
     cameras = SemanticField.load(desk / "run").cameras
     assert [camera["thumbnail"] for camera in header["cameras"]] == [f"thumbnails/{i}" for i in range(len(cameras))]
     assert header["title"] == "run"
+
+
+def test_a_splat_without_classes_opens(desk, tmp_path, capsys):
+    assert "semantic: 4,000 Gaussians" in view(capsys, tmp_path, desk / "my.ply", "--where", "html")
+    header = header_of(tmp_path / "view.html")
+    assert (header["classes"], header["query"], header["start"]["show"]) == ([], {}, "color")

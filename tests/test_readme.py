@@ -62,7 +62,7 @@ def test_examples_run_one_after_the_other(examples, desk, monkeypatch):
     exec(looking, known)
     view = known["view"]
     assert view.state.selected("semantic").any()
-    assert view.widget.question == "chair"
+    assert view.widget.wire["words"] == "chair"
     assert Path("room.html").stat().st_size > 100_000
     view.close()
 

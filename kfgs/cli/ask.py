@@ -155,7 +155,7 @@ def view(
     teacher: Teacher,
     classes: Classes,
 ) -> None:
-    """Explore a field: type "chair", change gamma and lambda, click a Gaussian, save the selection.
+    """Explore a field or a splat: type "chair", change gamma and lambda, click a Gaussian, select, edit, save.
 
     It opens a page in the browser, which only this machine can open. A selection in the semantic cloud lights up in the colour
     cloud. Gamma is the score that a Gaussian must exceed; lambda the distance within which the colour cloud lights up.
@@ -167,7 +167,7 @@ def view(
         kfgs view run/ --teacher lseg --weights demo_e200.ckpt    # any text
 
     Args:
-        source: A run folder of `kfgs fit` or its field, asked by text; or a splat with classes (`kfgs attach`), asked by class.
+        source: A run folder of `kfgs fit` or its field, asked by text; or any splat, asked by its classes (`kfgs attach`) if any.
         color: Colour splat in the same frame, any splat file. Of a field, by default: RUN/color.ply, or the splat it was made on.
         ask: A first question.
         where: browser; html (writes OUT/view.html, one file that any browser opens without kfgs, and ends); window (pyvista:
@@ -200,7 +200,7 @@ def view(
     say("\n".join(state.lines()))
     if where in ("window", "picture"):
         with Explorer(state, out=out, off_screen=where == "picture") as explorer:
-            explorer.set_show("labels")
+            explorer.set_show("labels" if meaning.names else state.first_show)
             if where == "window":
                 explorer.show()
             else:
@@ -235,7 +235,7 @@ def open_colors(source: Path, color: Path | None, meaning: Any) -> Any:
     return None
 
 
-def open_meaning(source: Path, classes: Classes, teacher: Teacher) -> tuple[Any, list[Any]]:
+def open_meaning(source: Path, classes: Classes, teacher: Teacher, *, labelled: bool = False) -> tuple[Any, list[Any]]:
     """The answers to questions, and the cameras of the scene (those that a field was trained on)."""
     from ..viewer import FieldMeaning, SplatMeaning
 
@@ -244,4 +244,4 @@ def open_meaning(source: Path, classes: Classes, teacher: Teacher) -> tuple[Any,
         field = open_field("source", source)
         label_set, embed = words_of(classes, teacher, field)
         return FieldMeaning(field, label_set, embed=embed), list(field.cameras) or cameras
-    return SplatMeaning(open_splats("source", source, labelled=True)), cameras
+    return SplatMeaning(open_splats("source", source, labelled=labelled)), cameras

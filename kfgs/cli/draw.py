@@ -65,7 +65,7 @@ def render(
     check_output("out", out, "a file")
     check_target(out, FPS, "out")
     walk_of = read_walk(path, frames)
-    meaning, cameras = open_meaning(source, classes, Teacher())
+    meaning, cameras = open_meaning(source, classes, Teacher(), labelled=True)
     if classes.loaded is not None:
         cameras = classes.loaded.cameras
     semantic, colors = meaning.gaussians.replace(names=meaning.names), open_colors(source, color, meaning)

@@ -3,7 +3,7 @@
 import { drawBoxes } from "./boxes.js";
 import { viewOf } from "./camera.js";
 import { TOOLS, makeCaptions, makeHelp, makePhoto, makeRail, makeTop, makeViews } from "./chrome.js";
-import { download, h, keep, kept, svg } from "./dom.js";
+import { download, h, svg } from "./dom.js";
 import { Eye } from "./eye.js";
 import { Model } from "./model.js";
 import { makePanel } from "./panel.js";
@@ -17,7 +17,6 @@ const SAID = 9000; // milliseconds that a message stays
 const BRUSH = [6, 24, 120]; // pixels: smallest, first, largest radius
 const NARROW = { narrow: 900, slim: 640, thin: 480 }; // CSS pixels of the width
 const LOW = 420; // of the height
-const REMEMBER = 500; // milliseconds after the last change
 const ASIDE = 1; // how far beside the originals copies appear, of their radius
 
 /**
@@ -43,10 +42,11 @@ class App {
     Object.assign(this, { root, packed, link, header: packed.header, model: new Model(packed) });
     this.modes = possibleModes(packed.header);
     this.brushRadius = BRUSH[1];
+    this.through = false; // whether tools select what others hide, too
     this.photo = null; // number of the view whose photo is shown
     this.view = null; // number of the view that the camera is at
     this.urls = new Map();
-    this.place = `kfgs ${location.pathname}`;
+    this.ondraw = () => {}; // after each picture
     this.build();
   }
 
@@ -81,13 +81,12 @@ class App {
     const onlost = () => this.fail("The graphics card stopped drawing. Reload the page.");
     await panes.start({ background: BACKGROUND[this.theme], onlost });
     this.eye = panes.eye = new Eye(this.header, model.extent(model.side));
-    panes.ondraw = () => (this.placePhoto(), this.drawBoxes());
+    panes.ondraw = () => (this.placePhoto(), this.drawBoxes(), this.ondraw());
     this.tools = new Tools(this.stage, this.eye, this);
     if (Number.isInteger(this.header.default_view)) this.goTo(this.header.default_view);
-    model.addEventListener("change", () => (this.refresh(), this.remember()));
+    model.addEventListener("change", () => this.refresh());
     this.watch();
     await this.begin();
-    await this.remembered();
     await this.panes.first();
     this.loading.remove();
     this.root.removeAttribute("aria-busy");
@@ -228,6 +227,11 @@ class App {
     this.rail.set(tool);
   }
 
+  setThrough(through) {
+    this.through = through;
+    this.rail.set(this.tools.tool);
+  }
+
   setTheme(theme) {
     this.root.dataset.theme = this.theme = theme;
     if (!this.panes.renderer) return;
@@ -250,7 +254,6 @@ class App {
     const asked = () => ({ words: model.words, gamma: model.gamma, lambda: lambda() });
     const wrote = (paths) => this.say(`Saved: ${paths.join(", ")}`);
     return {
-      describe: (side, index) => link.describe(side, index),
       similar: this.header.examples && (() => this.attempt(async () => model.ask(await link.similar(model.meant())))),
       split: () => this.attempt(() => this.split()),
       saveSelection: () => this.attempt(async () =>
@@ -283,7 +286,7 @@ class App {
     this.say("Drag the copy into its place; F shows it.");
   }
 
-  // the state: saved, opened, remembered when the tab is reloaded
+  // the state: saved and opened
 
   saveState() {
     download("kfgs_view.json", new Blob([this.state()], { type: "application/json" }));
@@ -310,27 +313,13 @@ class App {
       this.leaveView();
       this.eye.view = view;
     }
+    this.showSide();
+  }
+
+  /** Show the side that the model has. */
+  showSide() {
+    this.panes.list[0].side = this.model.side;
     this.refreshPanes();
-  }
-
-  /** Keep edits and selection for a reload of the tab. */
-  remember() {
-    if (!this.alone || this.root.hasAttribute("aria-busy")) return;
-    clearTimeout(this.remembering);
-    const { model } = this;
-    const wanted = () => (model.edited || model.selecting ? this.state() : null);
-    this.remembering = setTimeout(() => {
-      if (keep(this.place, wanted()) || this.warned) return;
-      this.warned = true;
-      this.say("This browser cannot keep so much for a reload of the tab: “Save state” writes it into a file.");
-    }, REMEMBER);
-  }
-
-  async remembered() {
-    const text = this.alone && kept(this.place);
-    if (!text) return;
-    await this.open(JSON.parse(text)).catch(() => keep(this.place, null)); // of another scene at this address
-    this.model.past = [];
   }
 
   // what the tools ask for (see tools.js); places are CSS pixels of the stage
@@ -346,40 +335,20 @@ class App {
     const index = this.panes.under(x, y);
     if (index < 0) return;
     this.leaveView();
-    this.glide(() => this.eye.setPivot(this.model.position(side, index), true));
-  }
-
-  /** A drag begins: turn about what is in the middle of the picture. */
-  grab() {
-    if (!this.eye.loose) return;
-    const { clientWidth, clientHeight } = this.stage;
-    const [pane] = this.panes.list;
-    const index = this.panes.under(clientWidth / (this.panes.layout === "split" ? 4 : 2), clientHeight / 2, pane);
-    if (index >= 0) this.eye.setPivot(this.model.position(pane.side, index));
+    this.glide(() => this.eye.setPivot(this.model.position(side, index)));
   }
 
   shape(polygon, how) {
     const { side } = this.panes.activate(polygon[0][0]);
-    this.model.select(side, this.panes.inside(polygon), how);
+    this.model.select(side, this.panes.inside(polygon, this.through), how);
   }
 
-  /** Paint the selection: a ball around the Gaussian under the pointer, as wide as the brush there. */
+  /** Paint the selection with a round brush; a stroke is one step of undo. */
   brush(x, y, how, first) {
     const { side } = first ? this.panes.activate(x) : this.panes.active;
-    const index = this.panes.under(x, y, this.panes.active, true);
-    if (index < 0) return;
-    const center = this.model.position(side, index);
-    const radius = (this.brushRadius * this.panes.depth(center)) / this.eye.focal;
-    this.model.paint(side, this.model.ball(side, center, radius), how, first);
-  }
-
-  /** Select what lies in a ball around the Gaussian under the pointer, as wide as was dragged. */
-  ball(x, y, radius, how) {
-    const { side } = this.panes.activate(x);
-    const index = this.panes.under(x, y, this.panes.active, true);
-    if (index < 0) return;
-    const center = this.model.position(side, index);
-    this.model.select(side, this.model.ball(side, center, (radius * this.panes.depth(center)) / this.eye.focal), how);
+    const r = this.brushRadius;
+    const round = Array.from({ length: 16 }, (_, k) => [x + r * Math.cos((k * Math.PI) / 8), y + r * Math.sin((k * Math.PI) / 8)]);
+    this.model.select(side, this.panes.inside(round, this.through), first || how === "subtract" ? how : "add", !first);
   }
 
   /** Move the selected Gaussians with the pointer, parallel to the picture; `upward`: along the scene's upward direction. */
@@ -472,6 +441,12 @@ class App {
     if (this.photo !== null) this.showPhoto(at);
   }
 
+  /** Look through any camera, {viewmat, K, width, height, near}. */
+  look(camera) {
+    this.leaveView();
+    this.glide(() => this.eye.lookThrough(camera));
+  }
+
   /** Go to the next camera of the scene, or the one before. */
   step(by) {
     const count = this.header.cameras.length;
@@ -555,7 +530,7 @@ class App {
     const keys = {
       "?": () => this.help.showModal(), "/": () => this.top.search.input.focus(), f: () => this.fit(),
       m: () => this.nextMode(), p: () => this.togglePhoto(), "[": () => this.step(-1), "]": () => this.step(1),
-      ",": () => this.sizeBrush(0.8), ".": () => this.sizeBrush(1.25),
+      x: () => this.setThrough(!this.through), ",": () => this.sizeBrush(0.8), ".": () => this.sizeBrush(1.25),
       Delete: () => model.remove(), Backspace: () => model.remove(),
       Escape: () => (this.tools.tool === "move" ? model.clear() : this.setTool("move")),
     };
@@ -574,7 +549,9 @@ class App {
 const possibleView = (view) =>
   [...(view?.R ?? []), ...(view?.position ?? []), view?.distance].filter(Number.isFinite).length === 13;
 
-function possibleModes({ sides, buffers }) {
-  const absent = { color: !sides.color && sides.semantic.sh_degree === null, latents: !buffers["semantic/latents"] };
+function possibleModes({ sides, buffers, classes }) {
+  const color = sides.color || sides.semantic.sh_degree !== null;
+  const classless = color && !classes.length;
+  const absent = { color: !color, labels: classless, score: classless, latents: !buffers["semantic/latents"] };
   return Object.fromEntries(Object.entries(MODES).filter(([mode]) => !absent[mode]));
 }

@@ -6,7 +6,7 @@ import { whole } from "./model.js";
 
 export const TOOLS = {
   move: ["Move the view", "1"], box: ["Box selection", "2"], lasso: ["Lasso selection", "3"], brush: ["Brush selection", "4"],
-  ball: ["Ball selection: drag from its middle", "5"], shift: ["Move the selected Gaussians (Shift: up and down)", "6"],
+  shift: ["Move the selected Gaussians (Shift: up and down)", "5"],
 };
 const HOWS = [
   ["replace", "=", "Select anew"], ["add", "+", "Add to the selection (Shift)"], ["subtract", "−", "Subtract from the selection (Alt)"],
@@ -17,11 +17,11 @@ const MEANINGS = {
 };
 const LAYOUTS = [["one", "One view"], ["split", "Side by side"], ["slider", "Slider"]];
 const HELP = [
-  ["Drag", "turn the view"], ["Right drag, Shift + drag", "move it sideways"], ["Middle drag, Ctrl + drag", "look around"], ["Wheel, two fingers, + −", "zoom"],
+  ["Drag", "turn the view; inside a room: look around"], ["Right drag, Shift + drag", "move it sideways"], ["Middle drag, Ctrl + drag", "look around"], ["Wheel, two fingers, + −", "zoom"],
   ["W A S D, Q E", "fly (Shift: faster)"], ["Click", "pick a Gaussian"], ["Double click", "turn about this point"],
   ["F", "fit the selection, or the first view"], ["[ ]", "previous and next photo view"], ["P", "photo over the view"],
-  ["/", "search"], ["M", "next colour mode"], ["1 2 3 4 5", "move, box, lasso, brush, ball"], ["6", "drag the selection (Shift: up and down)"], [", .", "smaller and larger brush"],
-  ["Shift or Alt + tool", "add to or subtract from the selection"], ["Delete", "remove the selection"],
+  ["/", "search"], ["M", "next colour mode"], ["1 2 3 4", "move, box, lasso, brush"], ["5", "drag the selection (Shift: up and down)"], [", .", "smaller and larger brush"],
+  ["Shift or Alt + tool", "add to or subtract from the selection"], ["X", "select through: also what others hide"], ["Delete", "remove the selection"],
   ["Ctrl + I", "invert the selection"], ["Ctrl + Z, Ctrl + Shift + Z", "undo, redo"],
   ["Escape", "move tool, then clear the selection"],
 ];
@@ -38,6 +38,7 @@ export function makeTop(app) {
     suggest: (text) => suggestions(text === model.answer?.words ? "" : text, names),
     describe: (name) => [h("span", {}, name), h("small", {}, count(name))],
   });
+  search.element.hidden = !names.length && !link.phrases;
   const meant = (words) => {
     const found = link.phrases ? [] : suggestions(words, names);
     return found.length === 1 ? found[0] : words; // the only class that the typed letters can become
@@ -77,12 +78,14 @@ export function makeRail(app) {
   });
   how.set("replace");
   const fit = iconButton("fit", "Fit the selection, or go to the first view", () => app.fit(), { key: "F" });
+  const through = iconButton("through", "Select through: also what others hide", () => app.setThrough(!app.through), { key: "X" });
   const set = (tool) => {
     buttons.forEach((one) => one.setAttribute("aria-pressed", String(one.dataset.tool === tool)));
-    how.element.hidden = tool === "move" || tool === "shift";
+    how.element.hidden = through.hidden = tool === "move" || tool === "shift";
+    through.setAttribute("aria-pressed", String(app.through));
   };
   set("move");
-  return { element: h("div", { class: "rail card", role: "toolbar", "aria-label": "Tools" }, ...buttons, fit, how.element), set };
+  return { element: h("div", { class: "rail card", role: "toolbar", "aria-label": "Tools" }, ...buttons, fit, how.element, through), set };
 }
 
 /** What each pane shows, at its upper edge, and the border between two. Returns {element, refresh()}. */

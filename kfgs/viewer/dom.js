@@ -6,8 +6,8 @@ const ICONS = {
   box: "M4 8V4h4M16 4h4v4M20 16v4h-4M8 20H4v-4M11 4h2M11 20h2M4 11v2M20 11v2",
   lasso: "M12 4c5 0 9 2.5 9 6s-4 6-9 6-9-2.5-9-6 4-6 9-6zM7 15.5c-1.5.5-2 3 0 3s2 2 0 3",
   brush: "M20 3l-9 10M11 13c-3 0-4 2-4 4s-2 3-4 3c3 2 10 2 10-3 0-2-1-3-2-4z",
-  ball: "M12 20a8 8 0 100-16 8 8 0 000 16zM4 12c3 3 13 3 16 0",
   shift: "M4 12h7M8 9l-4 3 4 3M13 5h7v14h-7z",
+  through: "M4 12h16M16 8l4 4-4 4M10 4v5M10 15v5",
   undo: "M9 6L4 11l5 5M4 11h10a6 6 0 010 12",
   redo: "M15 6l5 5-5 5M20 11H10a6 6 0 000 12",
   fit: "M4 9V4h5M20 9V4h-5M4 15v5h5M20 15v5h-5M12 12h.01",
@@ -205,26 +205,6 @@ export function download(name, blob) {
   const link = h("a", { href: URL.createObjectURL(blob), download: name });
   link.click();
   setTimeout(() => URL.revokeObjectURL(link.href), 10000);
-}
-
-/** Keep a text until the tab is closed, null: forget it. Returns whether that was possible. */
-export function keep(name, text) {
-  try {
-    sessionStorage.removeItem(name);
-    if (text !== null) sessionStorage.setItem(name, text);
-    return true;
-  } catch {
-    return false; // a frame without an origin of its own, or no space
-  }
-}
-
-/** What was kept, or null. */
-export function kept(name) {
-  try {
-    return sessionStorage.getItem(name);
-  } catch {
-    return null;
-  }
 }
 
 let taken = 0;

@@ -9,17 +9,18 @@ const FLY = 0.4; // of the scene's radius for a second
 
 export class Eye {
   /**
-   * @param {{up: number[], cameras: object[]}} header of the pack
+   * @param {{up: number[], cameras: object[], focus: number[]|null}} header of the pack
    * @param {{center: number[], radius: number}} ball where the scene is
    */
-  constructor({ up, cameras }, ball) {
+  constructor({ up, cameras, focus }, ball) {
     this.up = up;
     this.ball = ball;
     this.lens = cameras[0] ?? null;
     this.focal = 1; // CSS pixels, of the last picture
     this.size = [100, 100]; // of the last picture
     this.whole = false; // whether all of the lens's photo must be visible
-    this.loose = true; // whether the pivot's distance is only a guess
+    this.focus = cameras.length ? focus : ball.center; // what is in the middle of all; null: one stands inside
+    this.loose = false; // whether a drag looks around, for there is nothing to turn about
     const aside = Math.abs(up[0]) < 0.9 ? [1, 0.6, 0.6] : [0.6, 1, 0.6];
     const away = aside.map((value, axis) => ball.center[axis] + ball.radius * (value + up[axis]));
     this.view = lookAt(away, ball.center, up);
@@ -43,7 +44,14 @@ export class Eye {
     const view = viewOf(camera.viewmat, 1);
     this.view = { ...view, distance: Math.max(ahead(view, this.ball.center), 0.3 * this.ball.radius) };
     this.lens = camera;
-    this.loose = true;
+    this.aim();
+  }
+
+  /** Turn about the focus from now on, if it is in front. */
+  aim() {
+    const far = this.focus ? ahead(this.view, this.focus) : 0;
+    this.loose = !(far > 0);
+    if (far > 0) this.view = { ...this.view, distance: far };
   }
 
   /** Show a ball as large as possible; `from`: from a camera's side, and never smaller than the camera shows it (a room has walls). */
@@ -57,10 +65,9 @@ export class Eye {
     this.loose = false;
   }
 
-  /** Turn about a point from now on; with `turned`, look at it. */
-  setPivot(point, turned = false) {
-    if (turned) this.view = lookAt(this.view.position, point, this.up);
-    else this.view = { ...this.view, distance: Math.max(ahead(this.view, point), 1e-3) };
+  /** Look at a point, and turn about it from now on. */
+  setPivot(point) {
+    this.view = lookAt(this.view.position, point, this.up);
     this.loose = false;
   }
 
@@ -70,7 +77,7 @@ export class Eye {
 
   turn(dx, dy) {
     this.view = lookAround(this.view, (TURN / 2) * dx, -(TURN / 2) * dy, this.up);
-    this.loose = true;
+    this.aim();
   }
 
   pan(dx, dy) {
@@ -84,7 +91,7 @@ export class Eye {
   /** Fly for so many seconds along [right, up, forward]. */
   fly(seconds, direction) {
     this.view = fly(this.view, direction.map((value) => value * seconds * FLY * this.ball.radius));
-    this.loose = true;
+    this.aim();
   }
 
   /** The views on the way to another one. */

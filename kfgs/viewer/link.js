@@ -2,7 +2,7 @@
 
 import { bufferOf, questionNumber } from "./clouds.js";
 
-const PATIENCE = 60_000; // milliseconds for an answer of a kernel
+const PATIENCE = 600_000; // milliseconds for an answer of a kernel, which may have other cells to run first
 const NEEDS_PYTHON = "Any other words need Python: open the scene with “kfgs view” or in a notebook.";
 const NEEDS_TEACHER = "Any other words need the teacher's text encoder: start “kfgs view” with --teacher.";
 
@@ -44,54 +44,33 @@ export function suggestions(typed, names) {
 }
 
 function explain(words, names, needs) {
-  const near = nearest(words.trim(), names);
-  const hint = near ? `Did you mean “${near}”? ` : "";
-  return `“${words.trim()}” is none of the classes (${listed(names)}). ${hint}${needs}`;
+  const more = names.length > 8 ? ` and ${names.length - 8} more` : "";
+  return `“${words.trim()}” is none of the classes (${names.slice(0, 8).join(", ")}${more}). ${needs}`;
 }
 
-function listed(names) {
-  const more = names.length - 8;
-  return names.slice(0, 8).join(", ") + (more > 0 ? ` and ${more} more` : "");
-}
-
-/** The class name with the most pairs of letters in common with the words; null if they have less than half. */
-function nearest(words, names) {
-  const pairs = (text) => new Set([...text.toLowerCase()].map((_, i) => text.toLowerCase().slice(i, i + 2)));
-  const asked = pairs(words);
-  const scored = names.map((name) => {
-    const own = pairs(name);
-    return [(2 * [...own].filter((pair) => asked.has(pair)).length) / (own.size + asked.size), name];
-  });
-  scored.sort((a, b) => b[0] - a[0]);
-  return scored.length && scored[0][0] >= 0.5 ? scored[0][1] : null;
-}
-
-/** Answers from Python: session.py at the other end of a page's address or of a notebook's kernel. */
-export class PythonLink {
+/** Answers from Python what the pack does not: session.py at the other end of a page's address or of a notebook's kernel. */
+export class PythonLink extends OfflineLink {
   /**
    * @param {(name: string, args: object, attached?: Uint8Array) => Promise<[object, ArrayBuffer]>} call `callPage` or `callWidget`
-   * @param {object} header of the pack: has the classes, and whether Python answers any words
+   * @param {{header: object, data: ArrayBuffer}} packed its header says whether Python answers any words
    */
-  constructor(call, { phrases, classes }) {
-    Object.assign(this, { call, phrases, names: classes.map(({ name }) => name), python: true });
+  constructor(call, packed) {
+    super(packed);
+    Object.assign(this, { call, phrases: packed.header.phrases, python: true });
   }
 
-  /** As `OfflineLink.ask`; there is no `number` for words that are no class. */
+  /** As `OfflineLink.ask`; there is no `number` for words that only Python answers. */
   async ask(words) {
-    if (!this.phrases && className(words, this.names) === null) throw new Error(explain(words, this.names, NEEDS_TEACHER));
+    if (className(words, this.names) !== null) return super.ask(words);
+    if (!this.phrases) throw new Error(explain(words, this.names, NEEDS_TEACHER));
     const [answer, scores] = await this.call("ask", { words });
-    return { ...answer, number: answer.number ?? undefined, scores: new Float32Array(scores) };
-  }
-
-  /** The views that see a Gaussian: {views: [{index, name, weight}]}. */
-  async describe(side, index) {
-    return (await this.call("describe", { side, index }))[0];
+    return { ...answer, scores: new Float32Array(scores) };
   }
 
   /** An answer for what is like some semantic Gaussians, a mask; as `ask`. */
   async similar(mask) {
     const [answer, scores] = await this.call("similar", {}, bitsOf(mask));
-    return { ...answer, number: undefined, example: true, scores: new Float32Array(scores) };
+    return { ...answer, example: true, scores: new Float32Array(scores) };
   }
 
   /** Connected parts of a mask: {parts: [{count, corners}], numbers: Int16Array}, the largest first; -1: of no part. */
@@ -171,7 +150,7 @@ function joined(parts) {
 }
 
 /** A mask with one bit for each Gaussian, the lowest first. */
-function bitsOf(mask) {
+export function bitsOf(mask) {
   const bits = new Uint8Array(Math.ceil(mask.length / 8));
   for (let i = 0; i < mask.length; i++) bits[i >> 3] |= (mask[i] ? 1 : 0) << (i & 7);
   return bits;

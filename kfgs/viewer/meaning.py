@@ -120,19 +120,15 @@ class FieldMeaning:
 class SplatMeaning:
     """A labelled splat: the answer to a class is its Gaussians, with the scores of the file, or 1 if it has none.
 
-    Classes without a name are called "class 3". A ValueError if there are no labels.
+    Classes without a name are called "class 3". Without labels there is nothing to ask for, and all have no class.
     """
 
     phrases = examples = False
 
     def __init__(self, splats: Gaussians) -> None:
-        labels = splats.labels
-        if labels is None:
-            raise ValueError(
-                "splats.labels: expected labels [N] to ask for, got None; label it first, with `kfgs attach` or transfer_labels"
-            )
-        self.gaussians = splats
-        self.names = class_names(splats)
+        labels = torch.full((len(splats),), -1) if splats.labels is None else splats.labels
+        self.gaussians = splats.replace(labels=labels)
+        self.names = () if splats.labels is None else class_names(splats)
         self.scores, self.by = torch.ones_like(self.gaussians.opacities), "the file's classes"
         if splats.scores is not None:  # scores that are not finite become the lowest finite one
             values = splats.scores.to(self.gaussians.means)
@@ -143,15 +139,19 @@ class SplatMeaning:
 
     def ask(self, words: str) -> Asked:
         """Answer a class name; the suggested gamma lies below all scores of the class, so that all are selected."""
+        if not self.names:
+            raise ValueError(
+                f"words: expected a splat with classes, got one without for {words!r:.80}; `kfgs attach` adds them"
+            )
         words = self.names[class_indices(words if words in self.names else words.strip(), self.names)[0]]
         if words not in self._answers:
             member = OfClass(words).select(self.gaussians.replace(names=self.names)).mask
             scores = torch.where(member, self.scores, 0)
             own = scores[member]
-            low, high = (float(own.min()), float(own.max())) if len(own) else UNIT
-            if len(own) == 0 or (low > 0 and high <= 1):
-                low, high = UNIT
-            else:  # strictly below the lowest score, even after rounding to the precision of the scores
+            low, high = UNIT
+            if len(own) and not (own.min() > 0 and own.max() <= 1):
+                low, high = float(own.min()), float(own.max())
+                # strictly below the lowest score, even after rounding to the precision of the scores
                 below = float(torch.nextafter(own.min(), own.new_tensor(-torch.inf)))
                 low = min(low - 0.01 * max(high - low, 1e-3), below)
             selection = Selection(member & (scores > low), scores, low, "all of the class")

@@ -1,6 +1,7 @@
 /** The viewer's state and rules: question, gamma, lambda, hidden classes, selection, edits, undo. Uses no DOM. */
 
 import { bufferOf, cloudsOf } from "./clouds.js";
+import { bitsOf } from "./link.js";
 
 const MOST_UNDONE = 50; // steps
 const MOST_KEPT = 2e7; // Gaussians in all steps: a step keeps up to 80 bytes of each
@@ -216,22 +217,6 @@ export class Model extends EventTarget {
     this.step("select", { hand: how === "replace" ? { [side]: made } : { ...this.bySides(), [side]: made } }, joins);
   }
 
-  /** One part of a brush stroke. */
-  paint(side, mask, how, first) {
-    this.select(side, mask, first || how === "subtract" ? how : "add", !first);
-  }
-
-  /** A mask of the Gaussians whose centres lie in a ball. */
-  ball(side, [x, y, z], radius) {
-    const points = this.clouds[side].means;
-    const made = new Uint8Array(this.total(side));
-    for (let i = 0, j = 0; i < made.length; i++, j += 3) {
-      const [a, b, c] = [points[j] - x, points[j + 1] - y, points[j + 2] - z];
-      if (a * a + b * b + c * c <= radius * radius) made[i] = 1;
-    }
-    return made;
-  }
-
   /** The semantic Gaussians that are selected, or that give the selected colour Gaussians their class: a mask of the pack's. */
   meant() {
     const made = new Uint8Array(this.own.length);
@@ -359,23 +344,6 @@ export class Model extends EventTarget {
     return [...this.clouds[side].means.subarray(3 * index, 3 * index + 3)];
   }
 
-  /** The nearest Gaussians of the same side that are not removed: [class name, distance], nearest first. */
-  nearest(side, index, count) {
-    const { means: points, removed } = this.clouds[side];
-    const found = [];
-    for (let i = 0; i < points.length / 3; i++) {
-      if (i === index || removed[i]) continue;
-      const far = [0, 1, 2].reduce((all, axis) => all + (points[3 * i + axis] - points[3 * index + axis]) ** 2, 0);
-      if (found.length < count || far < found[count - 1][1]) {
-        found.push([i, far]);
-        found.sort((a, b) => a[1] - b[1]);
-        found.length = Math.min(found.length, count);
-      }
-    }
-    const labels = this.labels(side);
-    return found.map(([i, far]) => [this.names[labels[i]] ?? "no class", Math.sqrt(far)]);
-  }
-
   /** Middle and radius of the selected Gaussians of a side, or of all that are drawn; outliers do not count. */
   extent(side) {
     const chosen = this.selected(side);
@@ -398,10 +366,11 @@ export class Model extends EventTarget {
     const asked = { words: this.words, gamma: this.gamma, lambda: this.carried ? this.lambda : null };
     const sides = this.sides.map((side) => {
       const count = this.packed.header.sides[side].count;
-      const selected = this.byHand || this.answer?.example ? [...indices(this.selected(side))] : null;
+      const selected = this.byHand || this.answer?.example ? textOf(this.selected(side)) : null;
       return [side, { count, selected, edits: this.editsOf(side) }];
     });
-    return { format: "kfgs.view", version: 1, ...asked, hidden: [...this.hidden], sides: Object.fromEntries(sides) };
+    const shown = { hidden: [...this.hidden].sort((a, b) => a - b), side: this.side, picked: this.picked };
+    return { format: "kfgs.view", version: 1, ...asked, ...shown, sides: Object.fromEntries(sides) };
   }
 
   /** The edits of one side as JSON. Removals come last, so that the numbers in all others are those of the viewer. */
@@ -414,7 +383,7 @@ export class Model extends EventTarget {
   }
 
   /**
-   * Become what `toJSON` gave; one step of undo, except for lambda and hidden classes.
+   * Become what `toJSON` gave; one step of undo, except for what `arrange` does.
    * @param {object} saved
    * @param {object?} answer to the question that was saved
    * @throws {Error} a sentence for people, if it is of another scene, or somebody changed it into what cannot be done
@@ -437,13 +406,19 @@ export class Model extends EventTarget {
         edits.push({ ...edit, rows: { [side]: Uint32Array.from(where.indices) } });
         if (edit.op === "duplicate") count += where.indices.length;
       }
-      if (selected) hand[side] = new Uint8Array(count);
-      for (const i of selected ?? []) hand[side][i] = 1;
+      if (selected) hand[side] = maskOf(selected, count);
     }
-    this.hidden = new Set(saved.hidden);
     const given = answer && Number.isFinite(saved.gamma) && saved.gamma !== answer.gamma;
     this.step("open", { ...this.answered(answer), ...(given ? { gamma: saved.gamma, gammaHow: "given" } : {}), hand, edits, clouds: edits.reduce(after, this.original) });
-    this.setLambda(Number(saved.lambda ?? this.lambda));
+    this.arrange(saved);
+  }
+
+  /** Take over what is no step of undo: hidden classes, the side that is shown, the picked Gaussian, lambda. */
+  arrange({ hidden, side, picked, lambda }) {
+    this.hidden = new Set(hidden);
+    if (this.sides.includes(side)) this.side = side;
+    this.picked = picked ?? null;
+    this.setLambda(Number(lambda ?? this.lambda));
   }
 
   /** Counts of the question's scores in bins from `low` to `high`. */
@@ -546,6 +521,20 @@ export function sum(mask) {
 
 /** The numbers of what a mask has, Uint32Array. */
 const indices = (mask) => Uint32Array.from(mask.keys()).filter((i) => mask[i]);
+
+/** A mask as text: its bits (see link.js) in base64. */
+const textOf = (mask) => btoa(Array.from(bitsOf(mask), (byte) => String.fromCharCode(byte)).join(""));
+
+/** The mask of so many Gaussians that `textOf` gave; older files have the numbers of those that are set. */
+function maskOf(saved, count) {
+  const made = new Uint8Array(count);
+  if (Array.isArray(saved)) for (const i of saved) made[i] = 1;
+  else {
+    const bits = atob(saved);
+    for (let i = 0; i < Math.min(count, 8 * bits.length); i++) made[i] = (bits.charCodeAt(i >> 3) >> (i & 7)) & 1;
+  }
+  return made;
+}
 
 /** Whether an edit that was read can be done to these Gaussians of so many. */
 function possible({ op, factor, rgb, mode, translation }, rows, count) {

@@ -18,6 +18,7 @@ from PIL import Image
 
 from .._check import as_array
 from .._rows import check_finite
+from ..cameras import Camera
 from ..formats.encodings import pack_smallest_three
 from ..gaussians import Gaussians
 from ..scenes import Scene
@@ -117,6 +118,7 @@ def pack_scene(state: Exploration, *, title: str = "kfgs", scene: Scene | None =
         "clim": list(state.clim) if asked is None else [0.0, 1.0],
         "cameras": _add_cameras(buffers, state, scene),
         "up": upwards(state.cameras),
+        "focus": find_focus(state) if state.cameras else None,
         "default_view": 0 if state.cameras else None,
         "query": _add_scores(
             buffers, state, [*meaning.names, *([] if asked is None or asked.known else [asked.words])]
@@ -134,7 +136,9 @@ def pack_scene(state: Exploration, *, title: str = "kfgs", scene: Scene | None =
 def _add_side(buffers: _Buffers, state: Exploration, side: Side) -> dict[str, Any]:
     """Add the splats of a side; returns what is needed to decode them."""
     cloud = state.cloud(side)
-    _check_finite(side, cloud)
+    for name in ("quats", "scales", "opacities", "sh"):  # JSON has no NaN, and one would spoil the steps of all others
+        if (values := getattr(cloud, name)) is not None:
+            check_finite(f"{side}.{name}", values)
     places = as_array(cloud.means).astype(np.float64)
     center, half = core_box(places)
     log_scales = np.log(np.maximum(as_array(cloud.scales).astype(np.float64), 1e-30))
@@ -174,12 +178,23 @@ def rounded_far(far: Array, given: float) -> Array:  # [N] float64 -> [N] float3
     return np.where(wrong, np.nextafter(down, np.float32(np.inf)), down).astype(np.float32)
 
 
-def _check_finite(side: Side, cloud: Gaussians) -> None:
-    """JSON has no NaN, and a single one would spoil the steps of all others."""
-    for name in ("quats", "scales", "opacities", "sh"):
-        values = getattr(cloud, name)
-        if values is not None:
-            check_finite(f"{side}.{name}", values)
+def find_focus(state: Exploration) -> list[float] | None:
+    """The point that the cameras look at, which a drag turns about. None in a room, where a drag looks around.
+
+    That is: if one camera in ten looks elsewhere (by 25 degrees), or 1 % of the Gaussians are a ceiling over the cameras.
+    """
+    centers = np.stack([as_array(camera.center).astype(np.float64) for camera in state.cameras])
+    axes = np.stack([as_array(camera.viewmat).astype(np.float64)[2, :3] for camera in state.cameras])
+    across = np.eye(3) - axes[:, :, None] * axes[:, None]
+    point = np.linalg.lstsq(across.sum(0), np.einsum("cij,cj->i", across, centers), rcond=None)[0]
+    far, up = np.linalg.norm(point - centers, axis=1), np.array(upwards(state.cameras))
+    places = as_array(state.cloud(state.sides[-1]).means) - point
+    heights, top, reach = places @ up, ((centers - point) @ up).max(), np.median(far)
+    over = (
+        (heights > top) & (heights < top + 2 * reach) & (np.linalg.norm(places - np.outer(heights, up), axis=1) < reach)
+    )
+    looks = ((point - centers) * axes).sum(1) > 0.9 * far
+    return point.tolist() if looks.mean() >= 0.9 and over.mean() < 0.01 else None
 
 
 def core_box(means: Array) -> tuple[Array, Array]:  # [N, 3] -> [3], [3]
@@ -270,18 +285,17 @@ def _add_cameras(buffers: _Buffers, state: Exploration, scene: Scene | None) -> 
         if show is not None and camera.name in there:
             name = f"thumbnails/{index}"
             buffers.add(name, np.frombuffer(as_jpeg(show(camera.fitted(PHOTO))), dtype=np.uint8))
-        packed.append(
-            {
-                "name": camera.name,
-                "width": camera.width,
-                "height": camera.height,
-                "viewmat": camera.viewmat.detach().double().cpu().flatten().tolist(),
-                "K": [camera.K[row, column].item() for row, column in ((0, 0), (1, 1), (0, 2), (1, 2))],
-                "near": camera.near,
-                "thumbnail": name,
-            }
-        )
+        packed.append(pack_camera(camera) | {"thumbnail": name})
     return packed
+
+
+def pack_camera(camera: Camera) -> dict[str, Any]:
+    """A camera without distortion as JSON."""
+    return {
+        "name": camera.name, "width": camera.width, "height": camera.height, "near": camera.near,
+        "viewmat": camera.viewmat.detach().double().cpu().flatten().tolist(),
+        "K": [camera.K[row, column].item() for row, column in ((0, 0), (1, 1), (0, 2), (1, 2))],
+    }  # fmt: skip
 
 
 def as_jpeg(picture: Array) -> bytes:  # [h, w, 3] uint8

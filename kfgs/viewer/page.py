@@ -20,6 +20,7 @@ from .state import Exploration
 RENDERER = ("sorter.js", "camera.js", "tint.js", "clouds.js", "shaders.js", "gl.js", "pick.js", "renderer.js")
 INTERFACE = (
     "eye.js", "link.js", "model.js", "dom.js", "boxes.js", "panel.js", "tools.js", "panes.js", "chrome.js", "app.js",
+    "shared.js",
 )  # fmt: skip
 APP = (*RENDERER, *INTERFACE)
 
@@ -38,7 +39,7 @@ PYTHON_START = """\
     root.textContent = "";
     if (!loaded?.ok) throw new Error("Python does not answer; its terminal says why.");
     const [header, data] = kfgs.readMessage(await loaded.arrayBuffer());
-    window.viewer = await kfgs.mount(root, { header, data }, new kfgs.PythonLink(kfgs.callPage, header));"""
+    window.viewer = await kfgs.mount(root, { header, data }, new kfgs.PythonLink(kfgs.callPage, { header, data }));"""
 ROOT = '<div id="kfgs"></div>'
 """Holds the viewer, and shows that a page is one of kfgs."""
 PAGE = """\
@@ -72,7 +73,7 @@ addEventListener("DOMContentLoaded", async () => {{
 </body>
 </html>
 """
-_IMPORT = re.compile(r"""^import\s*\{([^}]*)\}\s*from\s*["']\./([\w.]+)["'];?[ \t]*$""", re.M)
+_IMPORT = re.compile(r"""^import\s*\{([^}]*)\}\s*from\s*["']\./(\w+)\.js["'];?[ \t]*$""", re.M)
 _EXPORT = re.compile(r"^export\s+(?=(?:async\s+)?(?:function\*?|class|const|let)\s+(\w+))", re.M)
 
 
@@ -112,22 +113,14 @@ def inline_script(modules: Sequence[str] = RENDERER, name: str = "kfgs") -> str:
     comes after those that it imports.
     """
     parts: list[str] = []
-    for position, module in enumerate(modules):
-        text = read_text(module)
-        missing = [other for _, other in _IMPORT.findall(text) if other not in modules[:position]]
-        if missing:
-            raise ValueError(f"modules: expected {missing[0]} before {module}, which imports it; change the order")
+    stems = [module.removesuffix(".js") for module in modules]
+    for stem in stems:
+        text = read_text(f"{stem}.js")
         exported = _EXPORT.findall(text)
-        text = _IMPORT.sub(lambda match: f"const {{{match[1].replace(' as ', ': ')}}} = {_variable(match[2])};", text)
+        text = _IMPORT.sub(lambda match: f"const {{{match[1].replace(' as ', ': ')}}} = ${match[2]};", text)
         text = _EXPORT.sub("", text)
-        if left := re.search(r"^(?:import|export)\b.*$", text, re.M):
-            raise ValueError(f"{module}: expected named imports and exports only, got {left[0]!r}")
-        parts.append(f"const {_variable(module)} = (() => {{\n{text}\nreturn {{{', '.join(exported)}}};\n}})();")
-    everything = ", ".join(f"...{_variable(module)}" for module in modules)
+        parts.append(f"const ${stem} = (() => {{\n{text}\nreturn {{{', '.join(exported)}}};\n}})();")
+    everything = ", ".join(f"...${stem}" for stem in stems)
     body = "\n".join(parts)
     script = f'const {name} = (() => {{\n"use strict";\n{body}\nreturn {{{everything}}};\n}})();\n'
     return script.replace("</script", "<\\/script")
-
-
-def _variable(module: str) -> str:
-    return "$" + module.removesuffix(".js").replace("-", "_").replace(".", "_")

@@ -7,13 +7,12 @@ const MANY = 12; // classes from which on the list has a filter
 const css = (rgb) => `rgb(${rgb.join(",")})`;
 
 /**
- * Build the panel. `act`: {ask(words), fit(), duplicate(), save(), open(file)}, and with Python {similar(), split(), saveSelection(), saveEdits(),
- * describe(side, index)}.
+ * Build the panel. `act`: {ask(words), fit(), duplicate(), save(), open(file)}, and with Python {similar(), split(), saveSelection(), saveEdits()}.
  * Returns {element, refresh()}.
  */
 export function makePanel(model, act) {
   const carried = model.carried ? [lambdaPart(model)] : [];
-  const shown = [scorePart(model), pickPart(model, act), selectionPart(model, act), partsPart(model, act), classesPart(model, act), ...carried];
+  const shown = [scorePart(model), pickPart(model), selectionPart(model, act), partsPart(model, act), classesPart(model, act), ...carried];
   return {
     element: h("aside", { class: "panel", "aria-label": "Search, classes and selection" }, ...shown.map((one) => one.element)),
     refresh: () => shown.forEach((one) => one.refresh()),
@@ -76,6 +75,7 @@ function classesPart(model, act) {
   const refresh = () => {
     const counts = model.counts(model.side);
     rows.forEach((row) => row.refresh(counts));
+    element.hidden = !model.names.length;
     all.hidden = !model.hidden.size;
   };
   return { element, refresh };
@@ -121,7 +121,7 @@ function selectionPart(model, act) {
   const recolor = h("label", { class: "pair", title: "Give the selection a colour, and keep its shading" }, "Recolour", color);
   const edits = [
     button("Remove", "Remove the selected Gaussians (Delete)", () => model.remove(), { class: "danger" }),
-    button("Duplicate", "Add a copy of the selected Gaussians beside them; move it with tool 6", act.duplicate),
+    button("Duplicate", "Add a copy of the selected Gaussians beside them; move it with tool 5", act.duplicate),
     recolor,
     h("label", { class: "pair", title: "Make the selection transparent" }, "Opacity", opacity),
   ];
@@ -150,7 +150,7 @@ function selectionPart(model, act) {
     if (model.now.what !== "opacity") opacity.value = 100;
     const more = other ? `, and ${whole(model.counts(other).selected)} ${SIDE_WORDS[other]} ones` : "";
     said.textContent = boxes.hidden
-      ? "Search for a class, or select with the box, the lasso, the brush or the ball."
+      ? `${model.names.length ? "Search for a class, or select" : "Select"} with the box, the lasso or the brush.`
       : `${whole(count)} ${model.kindOf(model.side)}s${more}`;
   };
   return { element, refresh };
@@ -173,25 +173,13 @@ function partsPart(model, act) {
   return { element, refresh };
 }
 
-function pickPart(model, act) {
+function pickPart(model) {
   const body = h("div", { class: "picked", "aria-live": "polite" });
-  let views = {};
   const element = section("Picked Gaussian", iconButton("close", "Unpick", () => model.pick(model.side, -1)), body);
   const refresh = () => {
     const found = model.describe();
     element.hidden = !found;
-    if (!found) return;
-    body.replaceChildren(...pickLines(model, found));
-    if (act.describe) seenBy(found);
-  };
-  const seenBy = async ({ side, index }) => {
-    const key = `${side} ${index}`;
-    if (views.key !== key) views = { key, found: act.describe(side, model.clouds[side].origin?.[index] ?? index) };
-    const { views: sights } = await views.found.catch(() => ({ views: [] }));
-    const now = model.picked;
-    if (!sights.length || !now || `${now.side} ${now.index}` !== key || body.querySelector(".seen")) return;
-    const names = sights.slice(0, 4).map(({ index, name, weight }) => `${name || `view ${index + 1}`} (${Math.round(100 * weight)} %)`);
-    body.append(h("p", { class: "note seen" }, `Seen by ${names.join(", ")}`));
+    if (found) body.replaceChildren(...pickLines(model, found));
   };
   return { element, refresh };
 }
@@ -211,8 +199,6 @@ function pickLines(model, found) {
     const reach = found.reached ? "Its label is from" : "Out of reach: the nearest labelled one is";
     lines.push(h("p", { class: "note" }, `${reach} semantic Gaussian ${found.source}, ${away}`));
   }
-  const others = model.nearest(found.side, found.index, 4).map(([name, far]) => `${name} ${far.toPrecision(2)}`);
-  if (others.length) lines.push(h("p", { class: "note" }, `Nearest: ${others.join(", ")}`));
   return lines;
 }
 

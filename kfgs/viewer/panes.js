@@ -59,10 +59,11 @@ export class Panes {
     return this.renderer.pick(x * ratio, y * ratio, model.drawn(pane.side), first);
   }
 
-  /** A mask of the Gaussians in a polygon (CSS pixels) in the active pane. */
-  inside(polygon) {
+  /** A mask of the Gaussians seen in a polygon (CSS pixels) in the active pane; or `through` others, too. */
+  inside(polygon, through) {
     this.prepare(this.active);
-    return this.renderer.within(polygon.map((place) => place.map((value) => value * this.ratio)), this.model.drawn(this.active.side));
+    const places = polygon.map((place) => place.map((value) => value * this.ratio));
+    return this.renderer.within(places, this.model.drawn(this.active.side), through);
   }
 
   /** Whether a pane dims what is not selected. The colours of scores say where gamma should be. */
@@ -148,6 +149,13 @@ export class Panes {
     this.camera = this.eye.at(this.layout === "split" ? Math.floor(width / 2) : width, height);
     this.eye.focal = this.camera.fx / this.ratio;
     this.renderer.setCamera(this.camera);
+  }
+
+  /** The camera of the last picture in the form of the pack's. */
+  lens() {
+    if (!this.camera) this.placeCamera();
+    const { viewmat, fx, fy, cx, cy, width, height, near } = this.camera;
+    return { name: "", width, height, near, viewmat: [...viewmat], K: [fx, fy, cx, cy] };
   }
 
   /** Where a pane is, device pixels from the top left of the canvas. Both sides of the slider are parts of one picture. */

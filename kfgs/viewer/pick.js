@@ -1,7 +1,9 @@
-/** Finds the Gaussian under a pixel, and the Gaussians in a region: what kfgs.viewer.gaussian_at computes. */
+/** Finds the Gaussian under a pixel, and the Gaussians that are seen in a region. */
 
 const LEAST = 1 / 255;
 const BACKGROUND = 0.05; // a pixel covered less shows the background
+const CELL = 4; // pixels between the places at which depth is looked up
+const BEHIND = 1.03; // what is deeper by no more than this factor belongs to what is seen
 
 /**
  * The Gaussian with the largest weight T alpha at a pixel; -1 for the background.
@@ -12,26 +14,26 @@ const BACKGROUND = 0.05; // a pixel covered less shows the background
  * @param {Uint8Array} drawn which Gaussians exist here
  */
 export function gaussianAt(cloud, camera, x, y, drawn) {
-  const hits = hitsAt(cloud, camera, x, y, drawn);
-  hits.sort((a, b) => a.depth - b.depth || a.index - b.index);
   let left = 1, covered = 0, best = -1, most = 0;
-  for (const {index, alpha} of hits) {
+  for (const splat of splatsIn(cloud, camera, [x, y, x, y], drawn)) {
+    const alpha = alphaAt(splat, x, y);
+    if (alpha < LEAST) continue;
     const after = left * (1 - alpha);
     if (after < 1e-4) break;
     const weight = alpha * left;
     covered += weight;
-    if (weight > most) [best, most] = [index, weight];
+    if (weight > most) [best, most] = [splat.index, weight];
     left = after;
   }
   return covered < BACKGROUND ? -1 : best;
 }
 
-/** Which Gaussians reach a pixel, with depth and alpha. */
-function hitsAt(cloud, camera, x, y, drawn) {
+/** The Gaussians that may reach a box of the picture, [left, top, right, bottom], nearest first, with their ellipses. */
+function splatsIn(cloud, camera, [x0, y0, x1, y1], drawn) {
   const {viewmat: m, fx, fy, cx, cy, width, height, near} = camera;
   const {means, reach} = {means: cloud.means, reach: cloud.reach ??= cloud.radii()};
   const limits = [(width / 2 - cx) / fx, (0.65 * width) / fx, (height / 2 - cy) / fy, (0.65 * height) / fy];
-  const hits = [];
+  const splats = [];
   for (let i = 0, j = 0; i < cloud.count; i++, j += 3) {
     if (reach[i] < 0) continue;
     const a = means[j], b = means[j + 1], c = means[j + 2];
@@ -41,18 +43,17 @@ function hitsAt(cloud, camera, x, y, drawn) {
     const ty = (m[4] * a + m[5] * b + m[6] * c + m[7]) / z;
     const jx = Math.min(Math.max(tx, limits[0] - limits[1]), limits[0] + limits[1]);
     const jy = Math.min(Math.max(ty, limits[2] - limits[3]), limits[2] + limits[3]);
-    const dx = x - (fx * tx + cx), dy = y - (fy * ty + cy);
+    const x = fx * tx + cx, y = fy * ty + cy;
+    const dx = x < x0 ? x0 - x : Math.max(x - x1, 0), dy = y < y0 ? y0 - y : Math.max(y - y1, 0);
     const rx = (fx / z) * reach[i], ry = (fy / z) * reach[i]; // 3.4 = what the low-pass of 0.3 adds, squared
     if (dx * dx > rx * rx * (1 + jx * jx) + 3.4 || dy * dy > ry * ry * (1 + jy * jy) + 3.4) continue;
-    if (!drawn[i]) continue;
-    const alpha = alphaAt(cloud, i, m, [fx / z, fy / z], [jx, jy], [dx, dy]);
-    if (alpha >= LEAST) hits.push({index: i, depth: Math.fround(z), alpha});
+    if (drawn[i]) splats.push({index: i, depth: Math.fround(z), x, y, ...ellipse(cloud, i, m, [fx / z, fy / z], [jx, jy])});
   }
-  return hits;
+  return splats.sort((p, q) => p.depth - q.depth || p.index - q.index);
 }
 
-/** alpha of Gaussian i at an offset (dx, dy) from its centre on the screen. */
-function alphaAt(cloud, i, m, focal, tangent, offset) {
+/** The covariance (a, b; b, c) of Gaussian i on the screen, and its opacity there. */
+function ellipse(cloud, i, m, focal, tangent) {
   const [w, x, y, z] = cloud.quatOf(i);
   const s = cloud.scalesOf(i);
   const R = [
@@ -69,39 +70,63 @@ function alphaAt(cloud, i, m, focal, tangent, offset) {
     b += u * v;
     c += v * v;
   }
-  const [dx, dy] = offset;
   const det = a * c - b * b, plain = Math.max(0, (a - 0.3) * (c - 0.3) - b * b);
-  const opacity = cloud.opacityOf(i) * (cloud.meta.antialiased ? Math.sqrt(plain / det) : 1);
-  const power = (c * dx * dx - 2 * b * dx * dy + a * dy * dy) / det;
-  return Math.min(0.99, opacity * Math.exp(-0.5 * power));
+  return {a, b, c, det, opacity: cloud.opacityOf(i) * (cloud.meta.antialiased ? Math.sqrt(plain / det) : 1)};
+}
+
+/** alpha of a Gaussian at a place of the picture. */
+function alphaAt({x, y, a, b, c, det, opacity}, px, py) {
+  const dx = px - x, dy = py - y;
+  return Math.min(0.99, opacity * Math.exp((-0.5 * (c * dx * dx - 2 * b * dx * dy + a * dy * dy)) / det));
+}
+
+/** How deep one sees at a place of a box: a function of x and y, to where less than half of the light comes through. */
+function depthsIn(cloud, camera, box, drawn) {
+  const [x0, y0] = box;
+  const [columns, rows] = [box[2] - x0, box[3] - y0].map((size) => Math.floor(size / CELL) + 2);
+  const light = new Float32Array(columns * rows).fill(1), depths = new Float32Array(columns * rows).fill(Infinity);
+  for (const splat of splatsIn(cloud, camera, box, drawn)) {
+    const wide = 2 * Math.log(Math.max(splat.opacity / LEAST, 1));
+    const span = (middle, spread, first, count) => {
+      const half = Math.sqrt(wide * spread);
+      return [Math.max(0, Math.ceil((middle - half - first) / CELL)), Math.min(count - 1, Math.floor((middle + half - first) / CELL))];
+    };
+    const [left, right] = span(splat.x, splat.a, x0, columns), [top, bottom] = span(splat.y, splat.c, y0, rows);
+    for (let row = top; row <= bottom; row++) {
+      for (let column = left, k = row * columns + left; column <= right; column++, k++) {
+        if (light[k] < 0.5) continue;
+        light[k] *= 1 - alphaAt(splat, x0 + CELL * column, y0 + CELL * row);
+        if (light[k] < 0.5) depths[k] = splat.depth;
+      }
+    }
+  }
+  return (x, y) => depths[Math.round((y - y0) / CELL) * columns + Math.round((x - x0) / CELL)];
 }
 
 /**
- * A mask of the Gaussians whose centres lie in a polygon.
+ * A mask of the Gaussians whose centres lie in a polygon and are seen there.
  * @param {number[][]} polygon [x, y] in pixels of the camera's picture
  * @param {Uint8Array} drawn which Gaussians exist here
+ * @param {boolean} through also those that are hidden behind others
  */
-export function gaussiansIn(cloud, polygon, camera, drawn) {
-  const inside = inPolygon(polygon, camera);
-  const {means} = cloud;
-  return drawn.map((on, i) => (on && inside(means[3 * i], means[3 * i + 1], means[3 * i + 2]) ? 1 : 0));
-}
-
-/** Even-odd rule on the projected centre. */
-function inPolygon(polygon, {viewmat: m, fx, fy, cx, cy, near}) {
-  const edges = polygon.map((from, k) => [...from, ...polygon[(k + 1) % polygon.length]]);
+export function gaussiansIn(cloud, polygon, camera, drawn, through) {
+  const {viewmat: m, fx, fy, cx, cy, near} = camera;
   const xs = polygon.map(([x]) => x), ys = polygon.map(([, y]) => y);
-  const [x0, x1, y0, y1] = [Math.min(...xs), Math.max(...xs), Math.min(...ys), Math.max(...ys)];
-  return (a, b, c) => {
+  const box = [Math.min(...xs), Math.min(...ys), Math.max(...xs), Math.max(...ys)];
+  const seen = through ? () => Infinity : depthsIn(cloud, camera, box, drawn);
+  const edges = polygon.map((from, k) => [...from, ...polygon[(k + 1) % polygon.length]]);
+  const {means} = cloud;
+  return drawn.map((on, i) => {
+    const [a, b, c] = [means[3 * i], means[3 * i + 1], means[3 * i + 2]];
     const depth = m[8] * a + m[9] * b + m[10] * c + m[11];
-    if (!(depth > near)) return false;
+    if (!on || !(depth > near)) return 0;
     const x = (fx * (m[0] * a + m[1] * b + m[2] * c + m[3])) / depth + cx;
     const y = (fy * (m[4] * a + m[5] * b + m[6] * c + m[7])) / depth + cy;
-    if (x < x0 || x > x1 || y < y0 || y > y1) return false;
-    let inside = false;
+    if (x < box[0] || x > box[2] || y < box[1] || y > box[3]) return 0;
+    let inside = 0; // by the even-odd rule
     for (const [ax, ay, bx, by] of edges) {
-      if (ay > y !== by > y && x < ((bx - ax) * (y - ay)) / (by - ay) + ax) inside = !inside;
+      if (ay > y !== by > y && x < ((bx - ax) * (y - ay)) / (by - ay) + ax) inside ^= 1;
     }
-    return inside;
-  };
+    return inside && depth <= BEHIND * seen(x, y) ? 1 : 0;
+  });
 }

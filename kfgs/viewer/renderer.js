@@ -223,10 +223,10 @@ export class Renderer {
     return found >= 0 ? found : gaussianAt(cloud, camera, x - left, y - top, drawn);
   }
 
-  /** A mask of the Gaussians in a polygon (pixels of the canvas), of those that a mask has. */
-  within(polygon, drawn) {
+  /** A mask of the Gaussians seen in a polygon (pixels of the canvas), of those that a mask has; or `through` others, too. */
+  within(polygon, drawn, through = false) {
     const {cloud, camera, left, top} = this.#under(...polygon[0], true);
-    return gaussiansIn(cloud, polygon.map(([x, y]) => [x - left, y - top]), camera, drawn);
+    return gaussiansIn(cloud, polygon.map(([x, y]) => [x - left, y - top]), camera, drawn, through);
   }
 
   /** Free the worker and the graphics memory. */

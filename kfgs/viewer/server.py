@@ -14,6 +14,7 @@ import socket
 import struct
 import sys
 from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from ipaddress import ip_address
 from threading import Thread
@@ -35,7 +36,7 @@ Call = Callable[[str, dict[str, Any], bytes], tuple[dict[str, Any], bytes]]
 """(name, arguments, attached bytes) -> answer and attached bytes. The page shows the message of a ValueError or TypeError."""
 
 
-class PageServer:
+class PageServer(AbstractContextManager["PageServer"]):
     """Serves a page (HTML) and its scene (for `readMessage` of link.js) from a thread of its own, until `close`.
 
     A call is a POST to `call`: 4 bytes with the length of a JSON text (little-endian), the JSON {"name", "args"}, and
@@ -79,9 +80,6 @@ class PageServer:
             self._server.shutdown()
             self._thread.join()
         self._server.server_close()
-
-    def __enter__(self) -> PageServer:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()

@@ -1,4 +1,4 @@
-"""What a page or a notebook widget asks of Python: answers to texts, what surrounds a Gaussian, and files.
+"""What a page or a notebook widget asks of Python: answers to texts, connected parts, and files.
 
 The viewer keeps its own state in the browser, so several pages do not disturb each other. Masks travel as bits, one for each
 Gaussian of a side, the lowest bit first.
@@ -7,7 +7,6 @@ Gaussian of a side, the lowest bit first.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict
 from itertools import count
 from pathlib import Path
 from threading import Lock
@@ -25,7 +24,6 @@ from ..labels import EditList, Selection, connected_parts
 from ..labels.edit_list import read_edits
 from ..viz.linked import evenly
 from .meaning import Asked
-from .picking import views_seeing
 from .state import Exploration, Side
 
 Answer = tuple[dict[str, Any], bytes]
@@ -47,7 +45,6 @@ class Session:
         self._calls = {
             "ask": self._ask,
             "similar": self._similar,
-            "describe": self._describe,
             "parts": self._parts,
             "save_selection": self._save_selection,
             "save_edits": self._save_edits,
@@ -58,7 +55,6 @@ class Session:
 
         - `ask` {words}: attaches the scores of the semantic Gaussians, float32, NaN where nothing is known
         - `similar` {}, with a mask of the semantic side: as `ask`, for what is like these Gaussians
-        - `describe` {side, index}: the views that see a Gaussian
         - `parts` {side, edits}, with a mask of it: connected parts, largest first; attaches the part of each Gaussian,
           int16, -1 for none
         - `save_selection` {words, gamma, lambda, sides, edits}, with a mask of each side
@@ -80,19 +76,11 @@ class Session:
         words = args["words"]
         if not isinstance(words, str) or not words.strip():
             raise ValueError(f"words: expected text, got {words!r:.80}; ask for a class or a phrase")
-        asked = self.state.meaning.ask(words)
-        packed = list(dict.fromkeys(self.state.meaning.names))  # classes of one name are one question
-        return _answer(asked, packed.index(asked.words) if asked.words in packed else None)
+        return _answer(self.state.meaning.ask(words))
 
     def _similar(self, _: dict[str, Any], attached: bytes) -> Answer:
         (mask,) = _masks({"semantic": len(self.state.cloud("semantic"))}, attached).values()
-        return _answer(self.state.meaning.similar(mask), None)
-
-    def _describe(self, args: dict[str, Any], _: bytes) -> Answer:
-        cameras = self.state.cameras
-        places = evenly(len(cameras), MOST_VIEWS).tolist()
-        sights = views_seeing(self.state.cloud(args["side"]), args["index"], [cameras[i] for i in places])
-        return {"views": [asdict(sight) | {"index": places[sight.index]} for sight in sights]}, b""
+        return _answer(self.state.meaning.similar(mask))
 
     def _parts(self, args: dict[str, Any], attached: bytes) -> Answer:
         side = _side(args["side"])
@@ -165,9 +153,8 @@ def save_selection(
     write_json(folder / "selection.json", details)
     for side in chosen:
         splats = clouds[side].select(masks[side])
-        if splats.scores is not None and not bool(splats.scores.isfinite().all()):
-            splats = splats.replace(scores=None)
-        write_splats(splats, folder / f"selection_{side}.ply")
+        unknown = splats.scores is None or bool(splats.scores.isnan().any())
+        write_splats(splats.replace(scores=None) if unknown else splats, folder / f"selection_{side}.ply")
     return sorted(folder.iterdir())
 
 
@@ -203,10 +190,10 @@ def _masks(counts: dict[Side, int], attached: bytes) -> dict[Side, Tensor]:
     return masks
 
 
-def _answer(asked: Asked, number: int | None) -> Answer:
+def _answer(asked: Asked) -> Answer:
     known = asked.selection
     scores = torch.where(asked.valid, known.scores, torch.nan).cpu().numpy().astype("<f4")
-    answer = {"words": asked.words, "number": number, "gamma": known.threshold, "how": known.how}
+    answer = {"words": asked.words, "gamma": known.threshold, "how": known.how}
     return answer | {"low": asked.low, "high": asked.high}, scores.tobytes()
 
 

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import numbers
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from .._check import as_array, check_choice, check_range
+from .._origin import to_world
 from ..cameras import Camera
 from ..gaussians import Gaussians
 from ..labels.transfer import Sources, positions
@@ -24,6 +26,17 @@ Show = Literal["labels", "rgb", "score", "latents"]
 SIDE_WORDS: dict[Side, str] = {"semantic": "semantic", "color": "colour"}
 GREY = np.array(UNLABELLED, dtype=np.uint8)
 SPAN = 30.0  # the lambda slider reaches from a 30th of the suggestion to 30 times it
+
+
+@dataclass(frozen=True)
+class Picked:
+    """A picked Gaussian."""
+
+    side: Side
+    index: int
+    name: str  # its class
+    score: float  # for the question, or of its label without one; NaN if unknown
+    position: tuple[float, float, float]  # in the world
 
 
 class Exploration:
@@ -67,7 +80,6 @@ class Exploration:
         self._own_labels = as_array(semantic.labels).astype(np.int64)
         self.source, self.far, suggested, self.distance_how = self._find_sources()
         self._base: dict[Side, Array] = {}
-        self._latents: Array | None = None
         colored = any(cloud.sh is not None for cloud in self._clouds.values())
         shows: dict[Show, bool] = {
             "labels": True,
@@ -151,6 +163,17 @@ class Exploration:
             values, known = self.asked.selection.scores, as_array(self.asked.valid)
         return self._on(side, np.where(known, as_array(values).astype(np.float64), np.nan), np.nan)
 
+    def describe(self, side: Side, index: int) -> Picked:
+        """What is known about a Gaussian."""
+        cloud = self.cloud(side)
+        x, y, z = to_world(cloud.means[index], cloud.origin).tolist()
+        score = float(self.scores(side)[index])
+        return Picked(side, index, self.class_name(int(self.labels(side)[index])), score, (x, y, z))
+
+    def class_name(self, label: int) -> str:
+        """The name of a class; "no class" for -1."""
+        return self.meaning.names[label] if label >= 0 else "no class"
+
     @property
     def clim(self) -> tuple[float, float]:
         """The scores of the darkest and the brightest colour, equal on both sides."""
@@ -182,12 +205,9 @@ class Exploration:
 
     def latents(self) -> Array:  # [S, 3] uint8
         """The latents of the semantic side as colours; grey if a latent was never learnt."""
-        if self._latents is None:
-            features = self._clouds["semantic"].features
-            assert features is not None
-            known = as_array(features.any(dim=1))[:, None]
-            self._latents = np.where(known, FeatureColors.fit(features)(features), GREY)
-        return self._latents.copy()
+        features = self._clouds["semantic"].features
+        assert features is not None
+        return np.where(as_array(features.any(dim=1))[:, None], FeatureColors.fit(features)(features), GREY)
 
     def details(self) -> dict[str, Any]:
         """The state as JSON: question, gamma, lambda, and the count of each class on each side.

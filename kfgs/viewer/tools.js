@@ -1,4 +1,4 @@
-/** Pointer and keys over the view: orbit, pan, zoom, fly, click; box, lasso, brush, ball; moving the selection. */
+/** Pointer and keys over the view: orbit, pan, zoom, fly, click; box, lasso, brush; moving the selection. */
 
 import { svg } from "./dom.js";
 
@@ -11,7 +11,7 @@ export class Tools {
   /**
    * @param {HTMLElement} stage what the pointer works on
    * @param {Eye} eye the camera
-   * @param {{moved(), grab(), click(x, y), twice(x, y), shape(polygon, how), ball(x, y, radius, how),
+   * @param {{moved(), click(x, y), twice(x, y), shape(polygon, how),
    *   brush(x, y, how, first), brushSize(), shift(dx, dy, upward, first)}} on places are CSS pixels of the stage; `how`:
    *   replace, add, subtract
    */
@@ -57,7 +57,6 @@ export class Tools {
     const how = event.altKey ? "subtract" : event.shiftKey ? "add" : this.how;
     this.drag = { kind, how, start: place, last: place, path: [place], far: 0 };
     if (kind === "brush") this.paint(place, true);
-    if (kind === "orbit" && !this.flying) this.on.grab();
   }
 
   move(event) {
@@ -77,15 +76,14 @@ export class Tools {
     if (["orbit", "pan", "look"].includes(drag.kind)) {
       if (drag.far < CLICK) return;
       if (drag.kind === "pan") eye.pan(dx, dy);
-      else if (drag.kind === "look" || this.flying) eye.turn(dx, dy);
+      else if (drag.kind === "look" || this.flying || eye.loose) eye.turn(dx, dy);
       else eye.orbit(dx, dy);
       this.on.moved();
     } else if (drag.kind === "brush") this.paint(place, false);
     else if (drag.kind === "shift") {
       this.on.shift(dx, dy, drag.how === "add", !drag.begun);
       drag.begun = true;
-    } else if (drag.kind === "ball") this.circle(drag.start, drag.far);
-    else {
+    } else {
       drag.path = drag.kind === "box" ? corners(drag.start, place) : [...drag.path, place];
       this.outline(drag.path);
     }
@@ -97,7 +95,6 @@ export class Tools {
     if (!drag || this.points.size) return;
     this.drag = null;
     if (drag.kind !== "brush" && drag.far < CLICK) this.on.click(...drag.start);
-    else if (drag.kind === "ball") this.on.ball(...drag.start, drag.far, drag.how);
     else if (drag.kind === "box" || drag.kind === "lasso") this.on.shape(drag.path, drag.how);
     if (drag.kind !== "brush") this.overlay.replaceChildren();
   }

@@ -30,6 +30,7 @@ from .pack import as_jpeg, pack_scene
 from .page import APP, document, inline_script, read_text, save_html
 from .server import PageServer, answer_call, pack_message
 from .session import Session
+from .shared import Shared
 from .state import Exploration
 from .window import Explorer
 
@@ -50,14 +51,9 @@ export default {
     const bytes = new Uint8Array(raw.buffer, raw.byteOffset, raw.byteLength);
     const header = model.get("header");
     const packed = { header, data: await kfgs.inflate(bytes, header) };
-    const link = new kfgs.PythonLink(kfgs.callWidget(model), header);
-    const app = await kfgs.mount(root, packed, link);
-    const ask = () => app.ask(model.get("question"));
-    model.on("change:question", ask);
-    return () => {
-      model.off("change:question", ask);
-      app.dispose();
-    };
+    const app = await kfgs.mount(root, packed, new kfgs.PythonLink(kfgs.callWidget(model), packed));
+    const end = await kfgs.share(app, model);
+    return () => (end(), app.dispose());
   },
 };
 """
@@ -125,13 +121,18 @@ def explore(
     return explorer
 
 
-class Viewer:
+class Viewer(Shared):
     """The WebGL viewer of an exploration. As the last value of a notebook's cell it is a widget.
 
-    The browser draws, and keeps what a person changes; Python answers texts and writes files. It opens with the state's
-    question, gamma, lambda and colours. After that, page and state are independent, except that `ask` in Python also asks
-    in an open widget. `scene` has the photos of the cameras, found by name; `out` is the folder for files, on the machine of
-    this program; `height` of the widget is in CSS pixels.
+    `question`, `gamma`, `distance`, `hidden`, `side`, `selection`, `edits`, `picked` and `camera` are what a person sees in
+    the widget. Set one, and the widget shows it, also if it is drawn later; `viewer.observe(act, "selection")` calls
+    `act(change)` when one changes (traitlets). A page of its own opens with the state's question, gamma, lambda and colours;
+    after that, page and Python are independent. `scene` has the photos of the cameras, found by name; `out` is the folder for
+    files, on the machine of this program; `height` of the widget is in CSS pixels.
+
+    Example:
+        >>> viewer.gamma = 0.6  # doctest: +SKIP
+        >>> plant = splat[viewer.selection]  # what was selected in the widget, or by the question  # doctest: +SKIP
     """
 
     def __init__(
@@ -143,15 +144,20 @@ class Viewer:
         out: str | Path = "kfgs_view",
         height: int = 640,
     ) -> None:
-        self.state, self.title, self.scene, self.height = exploration, title, scene, height
+        super().__init__(exploration)
+        self.title, self.scene, self.height = title, scene, height
         self.session = Session(exploration, out)
         self._widget: Any = None
 
     def ask(self, words: str | None) -> None:
-        """Ask for a class or a phrase, now in an open widget, or at the start of what is shown later."""
-        self.state.ask(words)
+        """Set `question`: search for a class or a phrase; None clears the search."""
+        self.question = words
+
+    def tell(self) -> None:
+        """Show in the widget what was set; it does so by itself."""
         if self._widget is not None:
-            self._widget.question = words or ""
+            wire = {part: value for part, value in self.wire.items() if part != "view"}
+            self._widget.wire, self._widget.view = wire, self.wire["view"]  # a moving camera sends the second alone
 
     def serve(self, host: str = "127.0.0.1", port: int = 0, *, report: Callable[[str], object] | None = None) -> None:
         """Open the page in the browser, and serve it until Ctrl-C.
@@ -191,8 +197,9 @@ class Viewer:
     def widget(self) -> AnyWidget:
         """The notebook widget (anywidget), made when it is first wanted. Where widgets cannot run, it is a picture."""
         if self._widget is None:
-            self._widget = self._make_widget()
-        return self._widget
+            self._make_widget()
+        made: AnyWidget = self._widget
+        return made
 
     def close(self) -> None:
         """Close the widget, if there is one."""
@@ -202,7 +209,7 @@ class Viewer:
     def _repr_mimebundle_(self, **options: Any) -> Any:
         return self.widget._repr_mimebundle_(**options)
 
-    def _make_widget(self) -> AnyWidget:
+    def _make_widget(self) -> None:
         require_widget()
         import anywidget
         import traitlets
@@ -215,7 +222,8 @@ class Viewer:
             _css = read_text("app.css")
             header = traitlets.Dict().tag(sync=True)
             data = traitlets.Bytes().tag(sync=True)
-            question = traitlets.Unicode().tag(sync=True)
+            wire = traitlets.Dict().tag(sync=True)
+            view = traitlets.Dict().tag(sync=True)
             height = traitlets.Int().tag(sync=True)
 
             def _repr_mimebundle_(self, **options: Any) -> Any:
@@ -225,8 +233,10 @@ class Viewer:
                     bundle["image/jpeg"] = still(state)
                 return made
 
-        words = "" if state.asked is None else state.asked.words
-        widget = Widget(header=packed.header, data=packed.compressed(), question=words, height=self.height)
+        self._widget = widget = Widget(header=packed.header, data=packed.compressed(), height=self.height)
+        self.tell()
+        widget.observe(lambda change: self.hear(change["new"]), "wire")
+        widget.observe(lambda change: self.hear({"view": change["new"]}), "view")
 
         def answer(_: Any, message: Any, buffers: list[Any]) -> None:
             attached = bytes(buffers[0]) if buffers else b""
@@ -234,7 +244,6 @@ class Viewer:
             widget.send({"id": message.get("id"), "answer": answered}, [more])
 
         widget.on_msg(answer)
-        return widget
 
 
 def require_widget() -> None:

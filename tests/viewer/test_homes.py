@@ -23,6 +23,8 @@ WIDGET = """async ({script, style, values}) => {
   const model = {
     get: (name) => state[name],
     on: (name, handler) => (handlers[name] ??= []).push(handler),
+    set: (name, value) => (state[name] = value),
+    save_changes: () => {},
     send: async (message, _, buffers) => {
       const [answer, attached] = await python(JSON.stringify(message), encode(new Uint8Array(buffers[0])));
       handlers["msg:custom"].forEach((handler) => handler(answer, [new DataView(decode(attached).buffer)]));
@@ -62,7 +64,7 @@ def in_widget(page, state, out):
 
     page.expose_function("python", python)
     page.set_content("<body></body>")
-    values = {name: getattr(widget, name) for name in ("header", "question", "height")}
+    values = {name: getattr(widget, name) for name in ("header", "wire", "view", "height")}
     values["data"] = base64.b64encode(widget.data).decode()
     page.evaluate(WIDGET, {"script": str(widget._esm), "style": str(widget._css), "values": values})
     yield
@@ -116,7 +118,8 @@ def test_one_person_everywhere(browser, tmp_path, home):
         if home is in_file:  # export
             assert not page.locator("text=Save Gaussians").is_visible()
             saved = json.loads(page.evaluate("JSON.stringify(viewer.model)"))
-            assert saved["sides"]["color"]["selected"] == np.flatnonzero(selected).tolist()
+            bits = np.packbits(selected, bitorder="little").tobytes()
+            assert base64.b64decode(saved["sides"]["color"]["selected"]) == bits
         else:
             page.click("text=Parts")
             page.click("li:has-text('chair 1') button, li:has-text('part 1') button")

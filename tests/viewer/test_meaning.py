@@ -130,7 +130,9 @@ def test_scores_of_a_splat_may_be_cosines_below_zero_or_missing():
 
 
 def test_splats_without_labels_or_names():
-    refused(lambda: SplatMeaning(splat_file(cloud(LINE))), "splats.labels:", "[N]", "got None", "`kfgs attach`")
+    plain = SplatMeaning(splat_file(cloud(LINE)))
+    assert (plain.names, plain.gaussians.labels.tolist()) == ((), [-1] * len(LINE))
+    refused(lambda: plain.ask("chair"), "words:", "without for 'chair'", "`kfgs attach`")
     with pytest.raises(ValueError, match=tells("class:", "got 'zebra'; take one of these classes")):
         SplatMeaning(splat_file(cloud(LINE, LABELS))).ask("zebra")
     made = SplatMeaning(splat_file(cloud(LINE, LABELS)).replace(names=("wall",)))

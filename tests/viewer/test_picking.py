@@ -1,3 +1,5 @@
+"""The oracle of a click: against renderings, and by hand."""
+
 from dataclasses import replace
 
 import pytest
@@ -5,10 +7,10 @@ import torch
 from cases_explorer import cloud
 from cases_viz import some_camera, some_gaussians
 from messages import refused, tells
+from oracles_picking import gaussian_at
 
 from kfgs.cameras import Camera, Distortion
 from kfgs.splat import rasterize
-from kfgs.viewer.picking import gaussian_at, views_seeing
 
 
 def straight(shift=0.0, name="front"):
@@ -78,24 +80,9 @@ def test_agrees_with_a_rendering_that_names_each_gaussian(seed, opaque):
         assert -1 in got
 
 
-def test_views_that_see_a_gaussian_the_best_first():
-    # the second, behind the first on the axis of the first view, is seen past it from the side
-    made = row([3.0, 6.0], [0.8, 0.9])
-    away = Camera(torch.diag(torch.tensor([-1.0, 1, -1, 1])), straight().K, 40, 20, "away")
-    views = [straight(), away, straight(1.0, "side"), straight(100.0, "far")]
-    sights = views_seeing(made, 1, views)
-    assert [(s.name, s.index) for s in sights] == [("side", 2), ("front", 0)]
-    assert [s.weight for s in sights] == pytest.approx([0.9, 0.2 * 0.9], abs=1e-6)
-    assert views_seeing(made, 0, [straight()])[0].weight == pytest.approx(0.8)
-    hidden = row([3.0, 6.0], [0.995, 0.9])
-    assert views_seeing(hidden, 1, [straight()]) == []  # 0.01 x 0.9 is no sight
-    assert views_seeing(hidden, 1, []) == []
-
-
 def test_wrong_arguments():
     made = row([3.0], [0.5])
     with pytest.raises(ValueError, match=tells("mask:", "[N]", "N = 1", "gaussians.means", "got (2,)")):
         gaussian_at(made, straight(), 1.0, 1.0, torch.ones(2, dtype=torch.bool))
     bent = replace(straight(), distortion=Distortion("kannala_brandt", (0.1, 0, 0, 0)))
     refused(lambda: gaussian_at(made, bent, 1.0, 1.0), "camera:", "got kannala_brandt")
-    refused(lambda: views_seeing(made, 1, [straight()]), "index:", "[0, 0]", "got 1")

@@ -3,12 +3,12 @@ import numpy as np
 import pytest
 import torch
 from cases_web import PAPER, needs_chromium, numbers, psnr
+from oracles_picking import gaussian_at
 
 from kfgs.cameras import Camera
 from kfgs.splat import rasterize
 from kfgs.viewer import Exploration
 from kfgs.viewer.pack import pack_scene
-from kfgs.viewer.picking import gaussian_at
 
 pytestmark = needs_chromium
 ENOUGH = 40  # dB
@@ -155,7 +155,10 @@ def test_a_polygon(viewer, state):
     inside = (seen[:, 2] > camera.near).numpy() & drawn
     for (ax, ay), (bx, by) in zip(lasso, lasso[1:] + lasso[:1], strict=True):
         inside &= ((bx - ax) * (xy[:, 1] - ay) - (by - ay) * (xy[:, 0] - ax) > 0).numpy()
-    within = "([lasso, drawn]) => base64(renderer.within(lasso, Uint8Array.from(drawn)))"
-    mask = numbers(viewer.run(within, [lasso, drawn.astype(int).tolist()]), np.uint8) > 0
+    within = "([lasso, drawn, through]) => base64(renderer.within(lasso, Uint8Array.from(drawn), through))"
+    mask = numbers(viewer.run(within, [lasso, drawn.astype(int).tolist(), True]), np.uint8) > 0
     assert inside.sum() > 5
     assert (mask != inside).sum() <= 1  # the pack's rounding at the border
+    seen = numbers(viewer.run(within, [lasso, drawn.astype(int).tolist(), False]), np.uint8) > 0
+    assert (seen <= mask).all()
+    assert 5 < seen.sum() < mask.sum()

@@ -1,4 +1,4 @@
-"""The notebook widget: what is sent to the browser, and how calls are answered. Its JavaScript: tests/page."""
+"""The notebook widget: what is sent to the browser, and how calls are answered. In a notebook: test_lab.py."""
 
 import base64
 import io
@@ -40,7 +40,7 @@ def test_the_scene_is_sent_once(tmp_path):
     assert widget.header == packed.header
     assert widget.header["start"]["words"] == "chair"
     assert widget.data == packed.compressed()
-    assert (widget.question, widget.header["phrases"]) == ("chair", False)
+    assert (widget.wire["words"], widget.header["phrases"]) == ("chair", False)
 
 
 def test_explore_in_a_notebook_gives_a_viewer(monkeypatch):
@@ -50,9 +50,9 @@ def test_explore_in_a_notebook_gives_a_viewer(monkeypatch):
     )
     assert isinstance(viewer, Viewer)
     viewer.ask("chair")
-    assert viewer.widget.question == "chair"
+    assert viewer.widget.wire["words"] == "chair"
     viewer.ask(None)
-    assert viewer.widget.question == ""
+    assert viewer.widget.wire["words"] is None
     bundle = viewer._repr_mimebundle_()
     assert "application/vnd.jupyter.widget-view+json" in (bundle[0] if isinstance(bundle, tuple) else bundle)
     viewer.close()

@@ -1,36 +1,20 @@
-"""Find the Gaussian under a pixel, and the views that see a Gaussian.
-
-Computed from rendering weights w = T alpha (Eq. 3), because VTK's picker only knows points.
-"""
+"""The Gaussian under a pixel, from rendering weights w = T alpha (Eq. 3): what a click in the viewer must find."""
 
 from __future__ import annotations
-
-from collections.abc import Sequence
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from .._check import check_shapes, check_whole
-from ..cameras import Camera
-from ..cameras.projection import world_to_camera
-from ..gaussians import Gaussians
-from ..splat import ALPHA_MIN, project
-from ..splat.engines.contract import ALPHA_MAX, TRANSMITTANCE_MIN
-from ..splat.project import FIELD_OF_VIEW_MARGIN
-from ..viz.gaussian_actor import LOW_PASS
+from kfgs._check import check_shapes
+from kfgs.cameras import Camera
+from kfgs.cameras.projection import world_to_camera
+from kfgs.gaussians import Gaussians
+from kfgs.splat import ALPHA_MIN, project
+from kfgs.splat.engines.contract import ALPHA_MAX, TRANSMITTANCE_MIN
+from kfgs.splat.project import FIELD_OF_VIEW_MARGIN
+from kfgs.viz.gaussian_actor import LOW_PASS
 
 BACKGROUND = 0.05  # a pixel covered less than this shows the background
-LEAST_WEIGHT = 0.01  # a view sees a Gaussian if its weight there is above this
-
-
-@dataclass(frozen=True)
-class Sight:
-    """A view that sees a Gaussian."""
-
-    name: str  # of the camera
-    index: int  # of the camera in the list
-    weight: float  # w = T alpha of the Gaussian at its projected centre, in (0.01, 0.99]
 
 
 def gaussian_at(
@@ -53,25 +37,6 @@ def gaussian_at(
     with torch.no_grad():
         index, weights = _weights_at(gaussians, camera, (x, y), mask)
     return None if float(weights.sum()) < BACKGROUND else int(index[weights.argmax()])
-
-
-def views_seeing(gaussians: Gaussians, index: int, cameras: Sequence[Camera]) -> list[Sight]:
-    """The views that see a Gaussian of a whole cloud: its weight T alpha at its projected centre is above 0.01. Best first."""
-    check_whole("index", index, 0, len(gaussians) - 1)
-    sights = []
-    with torch.no_grad():
-        for number, camera in enumerate(cameras):
-            own = project(gaussians.select(index), camera)
-            if len(own.index) == 0:
-                continue
-            x, y = own.means2d[0].tolist()
-            if not (0 <= x < camera.width and 0 <= y < camera.height):
-                continue
-            seen, weights = _weights_at(gaussians, camera, (x, y))
-            weight = float(weights[seen == index].sum())
-            if weight > LEAST_WEIGHT:
-                sights.append(Sight(camera.name, number, weight))
-    return sorted(sights, key=lambda sight: -sight.weight)
 
 
 def _weights_at(

@@ -1,0 +1,193 @@
+"""What Python reads, sets and observes of a viewer, without a browser; with one: test_lab.py."""
+
+import base64
+
+import cases_explorer
+import cases_page
+import numpy as np
+import pytest
+import torch
+import traitlets
+from messages import refused
+
+from kfgs.gaussians import Gaussians
+from kfgs.labels import Duplicate, EditList, InBox, Move, OfClass, Opacity, Recolor, Remove, Selection
+from kfgs.viewer import Exploration, SplatMeaning, Viewer
+
+NAMES = "question", "gamma", "distance", "hidden", "side", "selection", "edits", "picked", "camera"
+
+
+@pytest.fixture
+def viewer():
+    return Viewer(cases_page.exploration(("table", "chair", "odd")))
+
+
+def bits(mask):
+    return base64.b64encode(np.packbits(np.asarray(mask), bitorder="little").tobytes()).decode()
+
+
+def heard(viewer, **told):
+    """What the browser sends when a person changed something."""
+    viewer.hear(viewer.wire | told)
+
+
+def test_what_is_set_before_a_browser_shows_it_waits_in_the_wire(viewer):
+    viewer.ask(" Chair ")
+    viewer.gamma = 0.5
+    viewer.distance = 0.35
+    viewer.hidden = ["no class", "table"]
+    viewer.picked = 7
+    wire = viewer.wire
+    assert (wire["words"], wire["gamma"], wire["lambda"], wire["hidden"]) == ("chair", 0.5, 0.35, [-1, 0])
+    assert (viewer.question, viewer.hidden, wire["picked"]) == (
+        "chair",
+        ("no class", "table"),
+        {"side": "color", "index": 7},
+    )
+    state = viewer.state  # follows
+    assert (state.asked.words, state.gamma, state.distance) == ("chair", 0.5, 0.35)
+    assert viewer.selection.mask.tolist() == state.selected("color").tolist()
+    assert 0 < len(viewer.selection) < 450
+    assert (viewer.picked.name, viewer.picked.index) == (state.describe("color", 7).name, 7)
+    viewer.side = "semantic"
+    assert viewer.selection.mask.tolist() == state.selected("semantic").tolist()
+    viewer.gamma = None
+    assert viewer.gamma == state.asked.selection.threshold
+    viewer.question = None
+    assert (viewer.gamma, len(viewer.selection), wire["words"]) == (None, 0, "chair")
+
+
+def test_a_selection_is_a_mask_a_rule_or_an_answer_of_either_cloud(viewer):
+    state = viewer.state
+    viewer.ask("table")
+    mask = torch.arange(450) % 3 == 0
+    viewer.selection = mask
+    assert viewer.selection.mask.equal(mask)
+    assert base64.b64decode(viewer.wire["sides"]["color"]["selected"]) == base64.b64decode(bits(mask))
+    viewer.selection = OfClass("chair")
+    assert viewer.selection.mask.tolist() == (state.labels("color") == 1).tolist()
+    viewer.selection = Selection.of(state.cloud("semantic").labels == 2)  # of the semantic cloud, by its length
+    assert (viewer.side, len(viewer.selection)) == ("semantic", 60)
+    assert viewer.wire["sides"]["color"]["selected"] is None
+    viewer.selection = None
+    assert (len(viewer.selection), viewer.question) == (0, None)
+    before = viewer.wire
+    for wrong in (torch.ones(3, dtype=torch.bool), OfClass("lamp"), torch.ones(450)):
+        with pytest.raises((ValueError, TypeError)):
+            viewer.selection = wrong
+    assert viewer.wire == before
+    assert len(viewer.selection) == 0
+
+
+def test_a_person_is_heard_and_observers_are_told_once(viewer):
+    seen = []
+    viewer.observe(lambda change: seen.append((change["name"], change["new"])), list(NAMES))
+    mask = np.arange(450) < 9
+    sides = viewer.wire["sides"] | {"color": {"count": 450, "selected": bits(mask), "edits": []}}
+    heard(viewer, sides=sides, hidden=[2], **{"lambda": float(np.float32(0.4))})
+    assert [name for name, _ in seen] == ["hidden", "selection"]
+    assert seen[1][1].mask.tolist() == mask.tolist()
+    assert viewer.distance == 0.4  # and not what JavaScript rounds it to
+    heard(viewer, words="chair", gamma=0.25, sides=cases_page_sides(viewer))
+    assert (viewer.question, viewer.gamma, viewer.state.asked.words) == ("chair", 0.25, "chair")
+    assert viewer.selection.mask.tolist() == viewer.state.selected("color").tolist()
+    seen.clear()
+    heard(viewer)
+    assert seen == []
+    heard(viewer, picked={"side": "semantic", "index": 5})
+    assert (viewer.picked.side, viewer.picked.name) == ("semantic", "table")
+    heard(viewer, picked={"side": "color", "index": 999})  # a copy, which Python does not know
+    assert viewer.picked is None
+
+
+def cases_page_sides(viewer):
+    return {side: own | {"selected": None} for side, own in viewer.wire["sides"].items()}
+
+
+def test_an_observer_may_set_another_value(viewer):
+    viewer.observe(lambda change: viewer.set_trait("hidden", ("table",)), "question")
+    heard(viewer, words="chair", gamma=0.0)
+    assert (viewer.hidden, viewer.wire["hidden"]) == (("table",), [0])
+    slider = type("Slider", (traitlets.HasTraits,), {"value": traitlets.Float(0.5)})()
+    traitlets.link((viewer, "gamma"), (slider, "value"))
+    slider.value = 0.75
+    assert (viewer.gamma, viewer.wire["gamma"]) == (0.75, 0.75)
+    heard(viewer, gamma=0.3)
+    assert slider.value == 0.3
+
+
+def same_cloud(a: Gaussians, b: Gaussians):
+    for name in ("means", "opacities", "labels", "sh"):
+        torch.testing.assert_close(getattr(a, name), getattr(b, name))
+
+
+def test_edits_that_are_set_are_numbered_as_in_the_browser(viewer):
+    """By rules, which an earlier removal renumbers; in the browser no number changes, and removals come last."""
+    state = viewer.state
+    cloud = state.cloud("color").replace(labels=torch.from_numpy(state.labels("color")), names=state.meaning.names)
+    edits = (
+        EditList()
+        .then(Remove("table"))
+        .then(Recolor("chair", "#c04040"))
+        .then(Duplicate("chair", (0.0, 0.0, 2.0)))
+        .then(Move(InBox((-9, -9, 1), (9, 9, 9)), (0.0, 1.0, 0.0)))
+        .then(Remove(InBox((-9, -9, -9), (9, 0, 9))))
+        .then(Opacity("odd", 0.5))
+    )
+    viewer.edits = edits
+    ops = [edit["op"] for edit in viewer.wire["sides"]["color"]["edits"]]
+    assert ops == ["recolor", "duplicate", "move", "opacity", "remove"]
+    same_cloud(viewer.edits.apply(cloud), edits.apply(cloud))
+    removed = {i for i in viewer.wire["sides"]["color"]["edits"][-1]["where"]["indices"] if i < 450}
+    viewer.selection = torch.ones(450, dtype=torch.bool)
+    assert set(viewer.selection.indices.tolist()) == set(range(450)) - removed
+    viewer.edits = viewer.edits.undo()
+    assert ops[:-1] == [edit["op"] for edit in viewer.wire["sides"]["color"]["edits"]]
+    wrong = Move("chair", rotation=("z", 90)), Recolor("chair", "teal", mode="hue"), Opacity("lamp", 0.5)
+    before = viewer.wire
+    for edit in wrong:
+        with pytest.raises(ValueError, match=r"edits\[0\]|class"):
+            viewer.edits = EditList().then(edit)
+        assert (viewer.wire, len(viewer.edits)) == (before, 4)
+
+
+def test_the_camera_is_that_of_the_picture():
+    state = cases_explorer.line(cameras=cases_explorer.cameras())
+    viewer = Viewer(state)
+    assert viewer.camera.name == "view_0"
+    viewer.camera = "view_1"
+    np.testing.assert_allclose(viewer.camera.viewmat, state.cameras[1].viewmat, atol=1e-6)
+    told = viewer.wire["view"] | {"width": 640, "height": 400, "K": [500.0, 500.0, 320.0, 200.0], "name": ""}
+    viewer.hear({"view": told})
+    camera = viewer.camera
+    assert (camera.width, camera.height, float(camera.K[0, 0]), float(camera.K[1, 2])) == (640, 400, 500.0, 200.0)
+    refused(lambda: setattr(viewer, "camera", "view_9"), "camera", "view_0")
+    assert viewer.camera.width == 640
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("question", "lamp", ["'lamp'"]),
+        ("gamma", 0.5, ["gamma", "got none"]),
+        ("distance", -1.0, ["distance", "-1"]),
+        ("side", "left", ["side", "'left'"]),
+        ("hidden", ["lamp"], ["'lamp'"]),
+        ("picked", 450, ["picked", "449"]),
+        ("edits", EditList().then(Remove("lamp")), ["lamp"]),
+    ],
+)
+def test_what_cannot_be_set_is_refused_and_changes_nothing(viewer, name, value, words):
+    before = viewer.wire, [getattr(viewer, own) for own in NAMES if own != "selection"]
+    refused(lambda: setattr(viewer, name, value), *words, error=(ValueError, TypeError))
+    assert before == (viewer.wire, [getattr(viewer, own) for own in NAMES if own != "selection"])
+
+
+def test_a_splat_without_classes_can_be_selected_and_edited():
+    cloud = cases_page.exploration().cloud("color")
+    viewer = Viewer(Exploration(SplatMeaning(cloud)))
+    refused(lambda: viewer.ask("chair"), "words:", "kfgs attach", "'chair'")
+    viewer.selection = InBox((0, -9, -9), (9, 9, 9))
+    viewer.edits = EditList().then(Remove(viewer.selection))
+    kept = viewer.edits.apply(cloud)
+    assert len(kept) == int((cloud.means[:, 0] < 0).sum())
