@@ -36,11 +36,9 @@ class Distortion:
 
     def __post_init__(self) -> None:
         check_choice("model", self.model, COEFFICIENTS)
-        if len(self.coefficients) not in COEFFICIENTS[self.model]:
-            raise ValueError(
-                f"coefficients: expected {' or '.join(map(str, COEFFICIENTS[self.model]))} numbers for {self.model}, "
-                f"got {len(self.coefficients)}; pad with zeros"
-            )
+        if (count := len(self.coefficients)) not in COEFFICIENTS[self.model]:
+            expected = f"{' or '.join(map(str, COEFFICIENTS[self.model]))} numbers for {self.model}"
+            raise ValueError(f"coefficients: expected {expected}, got {count}; pad with zeros")
         for i, coefficient in enumerate(self.coefficients):
             check_range(f"coefficients[{i}]", coefficient, float("-inf"), closed=(False, False))
 
@@ -80,9 +78,8 @@ class Camera:
         object.__setattr__(self, "near", float(self.near))
         K, E = self.K.detach().double().cpu(), self.viewmat.detach().double().cpu()  # cameras are tiny
         if not (torch.isfinite(K).all() and torch.isfinite(E).all()):
-            raise ValueError(
-                f"viewmat, K: expected finite numbers, got NaN or infinity (camera {self.name!r}); leave this view out"
-            )
+            got = f"NaN or infinity (camera {self.name!r}); leave this view out"
+            raise ValueError(f"viewmat, K: expected finite numbers, got {got}")
         if K[0, 1] != 0 or K[1, 0] != 0 or K[2].tolist() != [0.0, 0.0, 1.0]:
             raise ValueError(f"K: expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] without skew, got {K.tolist()}")
         check_range("K[0, 0] (fx)", float(K[0, 0]), 0, closed=(False, False))
@@ -149,9 +146,7 @@ class Camera:
     @property
     def intrinsics_at_integer_centers(self) -> Tensor:  # [3, 3]
         """K for functions that put the centre of the first pixel at (0, 0), as kornia's grids do: cx, cy less 0.5."""
-        shift = torch.zeros_like(self.K)
-        shift[:2, 2] = 0.5
-        return self.K - shift
+        return self.K - self.K.new_tensor([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
 
     def resized(self, height: int, width: int) -> Camera:
         """The same view with another number of pixels; the two axes scale independently (kornia's `scale` does not).
@@ -192,13 +187,11 @@ def exact_rotation(name: str, matrix: Tensor) -> Tensor:  # [3, 3] -> [3, 3] flo
 
     A ValueError, which names the argument `name`, if it is not finite, not orthonormal to 1e-3, or a reflection.
     """
-    check_shapes((name, matrix, "3 3"))
     M = matrix.detach().double().cpu()
     error = (M @ M.T - torch.eye(3, dtype=torch.float64)).abs().max()
     if not error <= ROTATION_TOLERANCE:  # NaN fails every comparison
-        raise ValueError(
-            f"{name}: expected a rotation (rigid: without scale or shear), got {M.tolist()}; divide by the scale first"
-        )
+        got = f"{M.tolist()}; divide by the scale first"
+        raise ValueError(f"{name}: expected a rotation (rigid: without scale or shear), got {got}")
     if torch.linalg.det(M) < 0:
         raise ValueError(f"{name}: expected a rotation, got a reflection (determinant -1); check the axes' handedness")
     U, _, Vh = torch.linalg.svd(M)
@@ -221,8 +214,7 @@ def view_named(cameras: Sequence[Camera], view: str | Camera, where: str) -> Cam
         return view
     named = {camera.name: camera for camera in cameras}
     names = Names(named, bare=True)
-    name = names.find(view)
-    if name is None:
+    if (name := names.find(view)) is None:
         some = ", ".join([*list(named)[:3], "..."])
         raise ValueError(f"{where}: expected the name of a training view ({some}), got {view!r}; {names.advice(view)}")
     return named[name]

@@ -47,8 +47,6 @@ def path_cameras(
 
     check_whole("frames", frames, 2)
     check_whole("every", every, 1)
-    if size is not None:
-        check_size(size)
     cameras = [camera.with_origin(cameras[0].origin) for camera in cameras]
     keys = [*cameras[::every], *([cameras[-1]] if cameras and (len(cameras) - 1) % every else [])]
     if len(keys) > 1:
@@ -59,9 +57,9 @@ def path_cameras(
             f"cameras: expected at least two different views, got {len(keys)} (of {len(cameras)}, every {every}); pass the "
             "cameras of the scene in the order of the path"
         )
-    first, (height, width) = cameras[0].size, size or cameras[0].size
-    keys = [key if fits_aspect(key.size, first) else key.letterboxed(*first) for key in keys]
-    keys = [key.resized(height, width) for key in keys]
+    first = cameras[0].size
+    check_size(size := size or first)
+    keys = [(key if fits_aspect(key.size, first) else key.letterboxed(*first)).resized(*size) for key in keys]
     centers, rotations = _poses(keys)
     key_times = np.concatenate([[0.0], np.cumsum(_durations(centers, rotations))])
     times = np.linspace(0, key_times[-1], frames)
@@ -73,7 +71,7 @@ def path_cameras(
     viewmats = np.tile(np.eye(4), (frames, 1, 1))
     viewmats[:, :3, :3], viewmats[:, :3, 3] = R, t
     pairs = enumerate(zip(torch.from_numpy(viewmats), torch.from_numpy(Ks), strict=True))
-    return [Camera(*pair, width, height, f"path_{i:04d}", near=near, origin=origin) for i, pair in pairs]
+    return [Camera(*pair, size[1], size[0], f"path_{i:04d}", near=near, origin=origin) for i, pair in pairs]
 
 
 def _poses(keys: Sequence[Camera]) -> tuple[Array, Rotation]:  # [k, 3], k rotations from world to camera

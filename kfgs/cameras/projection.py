@@ -191,8 +191,7 @@ def from_kornia(pinhole: PinholeCamera) -> list[Camera]:
     centres on integers: add 0.5 to cx and cy of such a K first. A K from COLMAP has them on halves already.
     """
     count = pinhole.batch_size
-    for name in ("intrinsics", "extrinsics"):
-        check_shapes((f"pinhole.{name}", getattr(pinhole, name), (count, 4, 4)))
+    check_shapes(*((f"pinhole.{name}", getattr(pinhole, name), (count, 4, 4)) for name in ("intrinsics", "extrinsics")))
     viewmats, Ks = pinhole.extrinsics.clone(), pinhole.camera_matrix.clone()  # kornia's scale_ changes them in place
     rows = zip(viewmats, Ks, pinhole.width.tolist(), pinhole.height.tolist(), strict=True)
     return [Camera(*row) for row in rows]

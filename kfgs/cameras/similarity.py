@@ -62,10 +62,8 @@ class Similarity:
             raise ValueError(f"matrix: expected the last row 0 0 0 1, got {matrix[3].tolist()}; pass points as columns")
         determinant = float(torch.linalg.det(matrix[:3, :3]))
         if not determinant > 0:
-            raise ValueError(
-                f"matrix: expected a rotation times a positive scale, got determinant {determinant:g}; "
-                "a mirrored or flat frame cannot be reached by a similarity"
-            )
+            got = f"determinant {determinant:g}; a mirrored or flat frame cannot be reached by a similarity"
+            raise ValueError(f"matrix: expected a rotation times a positive scale, got {got}")
         scale = determinant ** (1 / 3)
         return Similarity(scale, exact_rotation("matrix", matrix[:3, :3] / scale), matrix[:3, 3])
 

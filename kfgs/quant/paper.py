@@ -71,18 +71,16 @@ class PaperCodebook:
         history: list[dict[str, Any]] = []
         bar = tqdm(range(self.epochs), desc="codebook", disable=progress is not True)
         for epoch in bar:
-            before, pruned, losses, similarities = len(book.rows), 0, list[float](), list[Tensor]()
+            before, pruned, visits = len(book.rows), 0, list[tuple[float, Tensor]]()
             period = 1 if epoch < self.eager_epochs else self.step_every
             order = torch.randperm(maps, generator=generator, device=generator.device).tolist()
             for seen, i in enumerate(order, start=1):
                 features = read(i)
                 if len(features):
-                    loss, similarity = book.learn_from(features)
-                    losses.append(loss)
-                    similarities.append(similarity)
+                    visits.append(book.learn_from(features))
                 if seen % period == 0 or seen == maps:
                     pruned += book.step()
-            size = len(book.rows)
+            size, (losses, similarities) = len(book.rows), zip(*visits, strict=True)
             record: dict[str, Any] = {"epoch": epoch, "size": size, "added": size - before + pruned, "pruned": pruned}
             record |= {"loss": sum(losses) / len(losses)} | coverage(torch.cat(similarities), self.expand_below)
             history.append(record)

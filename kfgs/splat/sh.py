@@ -75,6 +75,7 @@ def rotate_sh(
         tensor([0., 1., 0., 0.])
     """
     K = _check_degree(sh)
+    check_shapes(("rotation", rotation, "3 3"))
     R = exact_rotation("rotation", rotation)
     directions = _sphere(32)
     before, after = _basis(directions, K), _basis(directions @ R.T, K)
