@@ -106,8 +106,7 @@ def as_array(values: Any, name: str = "values") -> np.ndarray[Any, Any]:
     """
     if isinstance(values, Tensor):
         dense = values.detach().cpu()
-        array: np.ndarray[Any, Any] = (dense.float() if dense.dtype == torch.bfloat16 else dense).numpy()
-        return array
+        return (dense.float() if dense.dtype == torch.bfloat16 else dense).numpy()
     if isinstance(values, str) or any(hasattr(values, part) for part in PARTS):
         raise TypeError(f"{name}: expected numbers, got {type(values).__name__}; {_instead(values)}")
     return np.asarray(values)

@@ -131,10 +131,8 @@ def locked(folder: Path, name: str) -> Iterator[None]:
     try:
         lock = FileLock(folder / name).acquire(timeout=0)
     except Timeout as error:
-        raise ValueError(
-            f"{folder}: expected a folder that no other process writes to, got one in use; wait until that process has "
-            "ended, or name another folder"
-        ) from error
+        got = "one in use; wait until that process has ended, or name another folder"
+        raise ValueError(f"{folder}: expected a folder that no other process writes to, got {got}") from error
     with lock:
         yield
 
@@ -171,9 +169,8 @@ def read_text(path: str | Path, expected: str = "a text file") -> str:
     try:
         return path.read_text(encoding=text_encoding(path))
     except UnicodeError as error:
-        raise ValueError(
-            f"{path}: expected {expected} in UTF-8, got other bytes ({error}); save it as UTF-8"
-        ) from error
+        got = f"other bytes ({error}); save it as UTF-8"
+        raise ValueError(f"{path}: expected {expected} in UTF-8, got {got}") from error
 
 
 def text_encoding(path: Path) -> str:

@@ -64,15 +64,12 @@ class Gaussians:
             if self.labels.is_floating_point() or self.labels.dtype == torch.bool:
                 raise TypeError(f"labels: expected whole numbers, got {self.labels.dtype}; convert them with .long()")
             object.__setattr__(self, "labels", self.labels.long())  # unsigned ones have no -1
-        check_shapes(*((name, getattr(self, name), shape) for name, shape in zip(TENSORS, SHAPES, strict=True)))
+        columns = ((f"extra[{name!r}]", np.asarray(column), "N") for name, column in self.extra.items())
+        check_shapes(
+            *((name, getattr(self, name), shape) for name, shape in zip(TENSORS, SHAPES, strict=True)), *columns
+        )
         if self.sh is not None and self.sh.shape[1] not in (1, 4, 9, 16):
             raise ValueError(f"sh: expected 1, 4, 9 or 16 coefficients (degree 0 to 3), got {self.sh.shape[1]}")
-        for name, column in self.extra.items():
-            if np.shape(column) != (len(self),):
-                raise ValueError(
-                    f"extra[{name!r}]: expected [N] with N = {len(self)} (from means), got {np.shape(column)}; give one "
-                    "value per Gaussian"
-                )
 
     def __len__(self) -> int:
         return int(self.means.shape[0])

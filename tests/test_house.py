@@ -18,7 +18,7 @@ AIM = {  # lines of Python with docstrings (DESIGN, section 2); "base": the file
 }  # fmt: skip
 NOT_YET = {  # what is above its aim: a change may lower these numbers, and never raises them
     "fields": 2_657, "scenes": 3_285,
-    "quant": 1_261, "base": 1_257,
+    "quant": 1_261, "base": 1_250,
 }  # fmt: skip
 SCRIPTS = 4_000  # lines of the viewer's JavaScript
 PUBLIC, TOP, COMMAND, OPTIONS = 170, 40, 14, 109  # names, of kfgs itself, commands, options; limits: 170, 40, 14, 110
