@@ -10,7 +10,7 @@ seconds, and the peak memory of this process before transformers is loaded. It t
 
 With --whole the teacher as it is used: a checkpoint in the layout of `demo_e200.ckpt` (`random_lseg.py` writes one) and a
 picture, against torch's own loading, transformers' DPT, and the evaluation in windows as the tests' oracle does it, one
-pixel after another in float64, for every 8th channel. One window, then the paper's 26: five minutes on one core.
+pixel after another in float64, for every 8th channel. One window, then the paper's 26: five to nine minutes of one core.
 """
 
 from __future__ import annotations
@@ -62,10 +62,9 @@ def compare_whole(checkpoint: Path, path: Path, options: LSegOptions) -> None:
     picture = read_image(path).permute(2, 0, 1)
     height, width = picture.shape[1:]
     print(f"{path.name}, {height} x {width}: scales {options.scales}")
-    found, seconds = timed(
-        partial(load_lseg(checkpoint, scales=options.scales, flip=options.flip).encode_image, picture)
-    )
-    print(f"kfgs:         {seconds:.1f} s, {tuple(found.shape)}, peak {peak_gib():.2f} GiB")
+    teacher = load_lseg(checkpoint, scales=options.scales, flip=options.flip)
+    features, seconds = timed(partial(teacher.encode_image, picture))
+    print(f"kfgs:         {seconds:.1f} s, {tuple(features.shape)}, peak {peak_gib():.2f} GiB")
 
     state = torch.load(checkpoint, mmap=True, weights_only=True)["state_dict"]
     network = oracles_lseg.network(state, LSegConfig(), torch.float32)
@@ -77,7 +76,7 @@ def compare_whole(checkpoint: Path, path: Path, options: LSegOptions) -> None:
         return network(torch.from_numpy(window).float()[None])[0, ::EVERY].double().numpy()
 
     theirs, seconds = timed(lambda: torch.from_numpy(evaluate(x, head, 480, options.scales, options.flip)))
-    ours = found[::EVERY].double()
+    ours = features[::EVERY].double()
     print(f"transformers: {seconds:.1f} s, {tuple(theirs.shape)}; {difference(ours, theirs)}")
     cosine = torch.nn.functional.cosine_similarity(ours, theirs, dim=0)
     print(f"least cosine of a pixel: 1 - {1 - float(cosine.min()):.1e}")
@@ -125,8 +124,8 @@ def prompts(config: LSegConfig, count: int, generator: torch.Generator) -> Tenso
 def timed(call: Callable[[], Tensor]) -> tuple[Tensor, float]:
     """What a call returns, and its seconds."""
     start = time.perf_counter()
-    found = call()
-    return found, time.perf_counter() - start
+    result = call()
+    return result, time.perf_counter() - start
 
 
 def difference(ours: Tensor, theirs: Tensor) -> str:
