@@ -231,11 +231,11 @@ class Names:
         """The one of the names that is meant; None if there is none, or it is not clear which."""
         if name in self.names:
             return name
-        parts = folded_name(name).split("/")
-        ways = [("stem", name)]
+        parts, ways = folded_name(name).split("/"), [("stem", name)]
         for i in range(len(parts)):
-            tail = "/".join(parts[i:])
-            ways += [("folded", tail), ("folded stem", tail), ("folded stem", _ENDING.sub("", tail))]
+            tail = "/".join(parts[i:])  # without its ending, in its own case first: a.jpg is a.png, not A.png
+            ways += [("folded", tail), ("folded stem", tail)]
+            ways += [("stem", _ENDING.sub("", name)), ("folded stem", _ENDING.sub("", tail))]
         if self.bare and len(parts) == 1:
             ways += [("bare", parts[0]), ("bare", _ENDING.sub("", parts[0]))]
         fits = next((self._spellings[way] for way in ways if way in self._spellings), [])

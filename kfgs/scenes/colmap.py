@@ -16,12 +16,13 @@ from typing import Any
 
 import numpy as np
 import torch
+from kornia.geometry.linalg import inverse_transformation
 
 from .._files import Names
 from ..cameras.camera import Distortion, DistortionModel
 from .colmap_model import CAMERA_MODELS, ColmapModel, read_model
 from .files import SceneError, find_pictures, list_images, natural_key, scene_error, some
-from .posed import Matrix, PosedPicture, inverse_pose, scene_of_poses
+from .posed import Matrix, PosedPicture, scene_of_poses
 from .scene import Scene
 
 # COLMAP's model: (our lens, its number of coefficients). COLMAP's own order after the intrinsics is ours in each case:
@@ -84,7 +85,7 @@ def load_colmap(path: Path, images: Path | None) -> Scene:
         view.path = images / view.name
     points = (torch.from_numpy(model.points), torch.from_numpy(model.colors)) if len(model.points) else None
     notes = [*model.notes, *(note for note, lost_names in told.items() if lost_names)]
-    return scene_of_poses(path, views, points, notes, images)
+    return scene_of_poses(path, views, points, notes)
 
 
 def _views(path: Path, model: ColmapModel, files: Container[str] | None = None) -> list[PosedPicture]:
@@ -98,7 +99,7 @@ def _views(path: Path, model: ColmapModel, files: Container[str] | None = None) 
         if image.pose is not None:
             with scene_error(f"{where}: "):
                 view.K, view.distortion = convert_intrinsics(lens.model, lens.params)
-            view.pose = inverse_pose(image.pose)
+            view.pose = inverse_transformation(torch.from_numpy(image.pose)[None])[0].numpy()
         views.append(view)
     return views
 

@@ -12,7 +12,7 @@ import mmap
 import struct
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from fileinput import FileInput
 from pathlib import Path
 from typing import Any
@@ -67,15 +67,16 @@ class ColmapCamera:
         return all(abs(value) < MAX_NUMBER and (value > 0 or name[0] != "f") for name, value in named)
 
 
-@dataclass(frozen=True)
+@dataclass
 class ColmapImage:
     """One picture."""
 
     name: str
     camera_id: int
     pose: Matrix | None  # [4, 4] world to camera; None if it or the camera has numbers that are not finite or plausible
-    observed: Ints = field(repr=False)  # [n] the id of the 3-D point that each 2-D point sees, -1 = none
     norm: float = 1.0  # the length of the file's quaternion
+    observed: Ints = field(default_factory=lambda: np.zeros(0, np.int64), repr=False)
+    """[n] the id of the 3-D point that each 2-D point sees, -1 = none."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -95,17 +96,18 @@ def has_model(path: str | Path) -> bool:
     return any((as_path(path) / f"{name}.{suffix}").is_file() for name in FILES[:2] for suffix in ("bin", "txt"))
 
 
-def count_images(model: Path) -> int:
-    """The number of images in a model, without reading them; 0 if it is damaged."""
+def count_images(model: Path) -> int | None:
+    """The number of images in a model, without reading them; None if it is seen to be damaged."""
     file = model / "images.bin"
     with suppress(OSError, ValueError):
         if file.is_file():
             with file.open("rb") as head:
                 count = int.from_bytes(head.read(8), "little")
-            return count if count * LEAST_BYTES <= file.stat().st_size else 0
-        lines = _lines(model / "images.txt")
-        return sum(next(lines, "") != "" for _ in filter(_is_record, lines))
-    return 0
+            return count if 8 + count * LEAST_BYTES <= file.stat().st_size else None
+        file = model / "images.txt"
+        with FileInput(file, encoding=text_encoding(file)) as lines:
+            return sum(next(lines, "") != "" for _ in filter(_is_record, lines))
+    return None
 
 
 def read_model(path: str | Path) -> ColmapModel:
@@ -115,20 +117,18 @@ def read_model(path: str | Path) -> ColmapModel:
     lead to no 2-D point (of deleted images), are left out and noted.
     """
     folder = as_path(path)
-    if not folder.is_dir():
-        raise FileNotFoundError(f"{folder}: no such folder; expected a COLMAP model there")
     whole = [s for s in ("bin", "txt") if all((folder / f"{name}.{s}").is_file() for name in FILES)]
     if not whole:
         got = ", ".join(sorted(file.name for file in folder.iterdir() if file.stem in FILES)) or "none of these files"
         expected = "a COLMAP model (cameras, images and points3D, all as .bin or all as .txt)"
         raise SceneError(f"{folder}: expected {expected}, got {got}; copy the missing files or run COLMAP (`kfgs sfm`)")
-    cameras, images, points = (_read_table(folder / f"{name}.{whole[0]}", name) for name in FILES)
+    cameras, images, points = (_read_table(folder / f"{name}.{whole[0]}") for name in FILES)
     for key, image in images.items():
         if image.camera_id not in cameras:
             got = f"none for image {key} (camera {image.camera_id}); copy the cameras and images files of one model"
             raise SceneError(f"{folder}: expected cameras for all images, got {got}")
         if not cameras[image.camera_id].usable:
-            images[key] = replace(image, pose=None)
+            image.pose = None
     ids = np.array(sorted(points), np.int64)
     rows = [points[i] for i in ids.tolist()]
     places = np.array([place for place, _, _ in rows], np.float64).reshape(-1, 3)
@@ -171,53 +171,49 @@ def _check_tracks(file: Path, ids: Ints, tracks: list[Ints], images: dict[int, C
     return [f"{count} lead to no 2-D point that sees the point and were left out ({example}{gone})"]
 
 
-def _read_table(file: Path, name: str) -> dict[int, Any]:
+def _read_table(file: Path) -> dict[int, Any]:
     """The records of a file by their ids."""
-    table, lines = dict[int, Any](), _lines(file)
-    try:
-        for key, value in READERS[name + file.suffix](file if file.suffix == ".bin" else lines):
-            if key in table:
-                raise ValueError(f"id {key} again")
-            table[key] = value
-    except (ValueError, KeyError, OverflowError, struct.error) as error:
-        place = f"record {len(table) + 1}" if file.suffix == ".bin" else f"line {lines.lineno() or 1}"
-        advice = "copy the model again from its source, or write it again with COLMAP"
-        text = f"expected a COLMAP model, but {place} is truncated or damaged ({error})"
-        raise SceneError(f"{file}: {text}; {advice}") from error
+    table = dict[int, Any]()
+    with FileInput(file, encoding=text_encoding(file)) as lines:
+        try:
+            for key, value in READERS[file.name](file if file.suffix == ".bin" else lines):
+                if key in table:
+                    raise ValueError(f"id {key} again")
+                table[key] = value
+        except (ValueError, KeyError, OverflowError, struct.error) as error:
+            place = f"record {len(table) + 1}" if file.suffix == ".bin" else f"line {lines.lineno() or 1}"
+            advice = "copy the model again from its source, or write it again with COLMAP"
+            text = f"expected a COLMAP model, but {place} is truncated or damaged ({error})"
+            raise SceneError(f"{file}: {text}; {advice}") from error
     return table
 
 
-class _Binary:
+class _Binary(mmap.mmap):
     """A file of little-endian records without padding. It is mapped: only the parts that are used take memory."""
 
-    def __init__(self, file: Path) -> None:
+    def __new__(cls, file: Path) -> _Binary:
         with file.open("rb") as opened:
-            self.data, self.at = mmap.mmap(opened.fileno(), 0, access=mmap.ACCESS_READ), 0
+            return super().__new__(cls, opened.fileno(), 0, access=mmap.ACCESS_READ)
 
     def records(self) -> Iterator[_Binary]:
         """This, at the beginning of each record; the file must end after the last."""
         for _ in range(*self.take("Q")):
             yield self
-        if self.at != len(self.data):
-            raise ValueError(f"{len(self.data) - self.at} bytes follow the last")
+        if self.tell() != len(self):
+            raise ValueError(f"{len(self) - self.tell()} bytes follow the last")
 
     def take(self, layout: str) -> tuple[Any, ...]:
-        values = struct.unpack_from("<" + layout, self.data, self.at)
-        self.at += struct.calcsize("<" + layout)
-        return values
+        return struct.unpack("<" + layout, self.read(struct.calcsize("<" + layout)))
 
     def take_name(self) -> str:
-        end = self.data.find(b"\0", self.at)
-        if end < 0:
+        length = self.find(b"\0", self.tell()) - self.tell()
+        if length < 0:
             raise ValueError("its name does not end")
-        start, self.at = self.at, end + 1
-        return self.data[start:end].decode("utf-8")
+        return self.read(length + 1)[:-1].decode("utf-8")
 
     def take_array(self, dtype: np.dtype[Any]) -> NDArray[Any]:
         (count,) = self.take("Q")
-        values = np.frombuffer(self.data, dtype, count, self.at)  # refuses more than there is
-        self.at += values.nbytes
-        return values
+        return np.frombuffer(self.read(count * dtype.itemsize), dtype, count)  # refuses more than there is
 
 
 def _binary_cameras(file: Path) -> Iterator[tuple[int, ColmapCamera]]:
@@ -232,8 +228,9 @@ def _binary_images(file: Path) -> Iterator[tuple[int, ColmapImage]]:
     points = np.dtype([("xy", "<f8", 2), ("id", "<i8")])
     for record in _Binary(file).records():
         key, *pose, camera_id = record.take("I7dI")
-        name = record.take_name()
-        yield key, _image(name, camera_id, pose, record.take_array(points)["id"].astype(np.int64))
+        image = _image(record.take_name(), camera_id, pose)
+        image.observed = record.take_array(points)["id"].astype(np.int64)
+        yield key, image
 
 
 def _binary_points(file: Path) -> Iterator[tuple[int, tuple[Any, ...]]]:
@@ -241,10 +238,6 @@ def _binary_points(file: Path) -> Iterator[tuple[int, tuple[Any, ...]]]:
     for record in _Binary(file).records():
         key, x, y, z, *color, _ = record.take("q3d3Bd")
         yield key, ((x, y, z), color, record.take_array(track).astype(np.int64))
-
-
-def _lines(file: Path) -> FileInput[str]:
-    return FileInput(file, encoding=text_encoding(file))
 
 
 def _is_record(line: str) -> bool:
@@ -258,14 +251,15 @@ def _text_cameras(lines: FileInput[str]) -> Iterator[tuple[int, ColmapCamera]]:
 
 
 def _text_images(lines: FileInput[str]) -> Iterator[tuple[int, ColmapImage]]:
-    """Two lines each, of which the second may be empty."""
+    """Two lines each, of which the second may be empty. It is read when the first is known to be good: errors name a line."""
     for line in filter(_is_record, lines):
         key, *words, camera_id, name = line.strip().split(maxsplit=9)  # a name may hold blanks
-        pose = list(map(to_number, words))
+        image = _image(name, int(camera_id), list(map(to_number, words)))
+        yield int(key), image
         points = next(lines, "no line of 2-D points").split()
-        if len(points) % 3 or len(pose) != 7:
-            raise ValueError(f"{points[:4]} are not 2-D points as X Y POINT3D_ID, or there are {len(pose)} numbers")
-        yield int(key), _image(name, int(camera_id), pose, np.array(points[2::3], np.int64))
+        if len(points) % 3:
+            raise ValueError(f"{points[:4]} are not 2-D points as X Y POINT3D_ID")
+        image.observed = np.array(points[2::3], np.int64)
 
 
 def _text_points(lines: FileInput[str]) -> Iterator[tuple[int, tuple[Any, ...]]]:
@@ -284,14 +278,14 @@ READERS: dict[str, Callable[[Any], Iterator[tuple[int, Any]]]] = {
 }  # fmt: skip
 
 
-def _image(name: str, camera_id: int, numbers: list[float], observed: Ints) -> ColmapImage:
+def _image(name: str, camera_id: int, numbers: list[float]) -> ColmapImage:
     """An image with its pose from qw qx qy qz tx ty tz."""
     if not (name.isprintable() and is_inside(name)):
         raise ValueError(f"{name!r} is not a file inside the image folder: rename the image in the model")
-    norm = math.hypot(*numbers[:4])
+    w, x, y, z, tx, ty, tz = numbers
+    norm = math.hypot(w, x, y, z)
     if not abs(norm - 1) < QUATERNION_SLACK or not all(abs(number) < MAX_NUMBER for number in numbers):
-        return ColmapImage(name, camera_id, None, observed)
-    w, x, y, z, *place = numbers
+        return ColmapImage(name, camera_id, None)
     pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = Rotation.from_quat([x, y, z, w]).as_matrix(), place
-    return ColmapImage(name, camera_id, pose, observed, norm)
+    pose[:3, :3], pose[:3, 3] = Rotation.from_quat([x, y, z, w]).as_matrix(), (tx, ty, tz)
+    return ColmapImage(name, camera_id, pose, norm)

@@ -28,12 +28,6 @@ Split = str | Sequence[str] | Sequence[int]
 """The name of a split, `all`, or a list of view names or indices."""
 
 
-def select_views(scene: Scene, split: Split) -> Scene:
-    """The scene with the views of a split."""
-    check_is_scene(scene)
-    return scene.select(scene.views(split) if isinstance(split, str) else split)
-
-
 @dataclass(frozen=True)
 class Manifest:
     """Which teacher made the maps of a folder, and from which pictures (`features.json`)."""
@@ -56,9 +50,8 @@ def read_manifest(folder: str | Path) -> Manifest | None:
     entries = value if isinstance(value, dict) and value.get("format") == FORMAT else {}
     teacher, pictures = entries.get("teacher"), entries.get("pictures")
     if not isinstance(teacher, dict) or not isinstance(pictures, dict):
-        advice = (
-            "delete it to use the maps without it, or the maps, too, and run `kfgs features`, which makes them again"
-        )
+        again = "run `kfgs features`, which makes them again"
+        advice = f"delete it to use the maps without it, or the maps, too, and {again}"
         raise ValueError(f"{path}: expected a manifest of kfgs ({FORMAT}), got something else; {advice}")
     return Manifest(teacher, {str(stem): str(digest) for stem, digest in pictures.items()})
 
@@ -95,7 +88,8 @@ def extract_features(
             one before; if the folder holds maps of another teacher or program, or another process is writing to it.
         FileNotFoundError: if a picture is missing.
     """
-    folder, (encode, identity), chosen = as_path(folder), _as_encoder(teacher), select_views(scene, split)
+    check_is_scene(scene)
+    folder, (encode, identity), chosen = as_path(folder), _as_encoder(teacher), scene.select(split)
     pictures = {chosen.stem(i): path for i, path in enumerate(chosen.image_paths)}
     if not pictures:
         raise ValueError("split: expected at least one view, got none; name some")

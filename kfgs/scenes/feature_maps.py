@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import zipfile
 from collections.abc import Iterator, Sequence
 from functools import cached_property
@@ -20,14 +19,10 @@ from .._files import Names, as_path
 from .._rows import EPS, row_norms
 from ..cameras.resample import fits_aspect
 from ..quant.maps import grid_slices
-from .extract import ENDINGS, FEATURE_3DGS, OWN, SAFETENSORS, Split, count_bad, read_manifest, select_views
-from .files import IMAGE_SUFFIXES, some
-from .scene import Scene
+from .extract import ENDINGS, FEATURE_3DGS, OWN, SAFETENSORS, Split, count_bad, read_manifest
+from .files import IMAGE_SUFFIXES, list_images, some
+from .scene import Scene, check_is_scene
 
-StoredMap = Tensor | NDArray[Any]
-"""A map [h, w, D], mapped into memory: values are read when they are used."""
-Size = tuple[int, int]
-"""(H, W) of a picture."""
 AGAIN = "encode it again, or leave the photo out (split.json)"
 ROW_BLOCK = 32  # rows of a map converted at a time: 30 MB in single precision at 480 x 512 channels
 
@@ -68,7 +63,7 @@ class FeatureFolder(Sequence[Tensor]):
         stems: Sequence[str] | None = None,
         *,
         channels: int | None = None,
-        sizes: Sequence[Size | None] | None = None,
+        sizes: Sequence[tuple[int, int] | None] | None = None,
     ) -> None:
         self.path = as_path(path)
         if not self.path.is_dir():
@@ -93,7 +88,8 @@ class FeatureFolder(Sequence[Tensor]):
 
     def of(self, scene: Scene, split: Split = "train") -> FeatureFolder:
         """The maps of some views of a scene: of a split, of `all`, or of a list of view names or indices."""
-        chosen = select_views(scene, split)
+        check_is_scene(scene)
+        chosen = scene.select(split)
         stems, sizes = [chosen.stem(i) for i in range(len(chosen))], [camera.size for camera in chosen.cameras]
         return FeatureFolder(self.path, stems, channels=self.channels, sizes=sizes)
 
@@ -107,14 +103,12 @@ class FeatureFolder(Sequence[Tensor]):
     def _listed(self) -> dict[str, Path]:
         """All maps of the folder by stem; of several files with one stem, the first in the order of `ENDINGS`."""
         maps: list[tuple[int, str, Path]] = []
-        for here, folders, names in os.walk(self.path):
-            folders[:] = sorted(name for name in folders if not name.startswith("."))
-            for name in sorted(name for name in names if name.endswith(ENDINGS) and not name.startswith(".")):
-                file, ending = Path(here) / name, next(ending for ending in ENDINGS if name.endswith(ending))
-                stem = file.relative_to(self.path).as_posix().removesuffix(ending)
+        for name in list_images(self.path, tuple(ending.lower() for ending in ENDINGS)):
+            for ending in filter(name.endswith, ENDINGS):
+                stem = name.removesuffix(ending)
                 after = PurePosixPath(stem).suffix  # rgb_1.png.npy is the map of rgb_1, too
                 stem = stem.removesuffix(after) if after.lower() in IMAGE_SUFFIXES else stem
-                maps.append((ENDINGS.index(ending), stem, file))
+                maps.append((ENDINGS.index(ending), stem, self.path / name))
         return {stem: file for _, stem, file in sorted(maps, key=lambda entry: -entry[0])}
 
     def _find(self, stems: Sequence[str]) -> dict[str, Path]:
@@ -170,7 +164,7 @@ class FeatureFolder(Sequence[Tensor]):
                 raise ValueError(f"{self.files[i]}: expected finite features, got {bad} NaN or infinite; {AGAIN}")
             yield block
 
-    def _open(self, file: Path, size: Size | None) -> StoredMap:  # [h, w, D]
+    def _open(self, file: Path, size: tuple[int, int] | None) -> Tensor | NDArray[Any]:  # [h, w, D]
         """Map a file into memory without reading its values.
 
         Feature 3DGS writes [D, h, w], kfgs [h, w, D]. In other files a known number of channels decides, then the aspect of
@@ -220,7 +214,7 @@ class FeatureFolder(Sequence[Tensor]):
         """
         sizes = dict(zip(self.stems, self.sizes, strict=True))
         if scene is not None:
-            chosen = select_views(scene, split)
+            chosen = scene.select(split)
             sizes = {chosen.stem(i): camera.size for i, camera in enumerate(chosen.cameras)}
         files, shapes, turned = self._find(list(sizes)), dict[str, tuple[int, ...]](), dict[str, str]()
         problems = {stem: "expected its map, got none" for stem in sizes if stem not in files}
@@ -255,7 +249,7 @@ class FeatureFolder(Sequence[Tensor]):
 
 
 def read_rows(
-    stored: StoredMap,  # [h, w, D]
+    stored: Tensor | NDArray[Any],  # [h, w, D]
     rows: slice = slice(None),
     columns: slice = slice(None),
 ) -> Iterator[Tensor]:  # each [at most ROW_BLOCK, columns, D] float32

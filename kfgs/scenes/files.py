@@ -9,7 +9,7 @@ import os
 import re
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -46,14 +46,6 @@ def some(names: list[str], count: int = 5) -> str:
     return ", ".join(names[:count]) + (f" and {len(names) - count} more" if len(names) > count else "")
 
 
-def is_file(path: Path) -> bool:
-    """Whether there is a file under this path; False for a name that no file can have, where Path.is_file raises."""
-    try:
-        return path.is_file()
-    except (OSError, ValueError):
-        return False
-
-
 def is_inside(name: str) -> bool:
     """Whether a name leads to a place inside its folder."""
     return bool(name) and not PurePosixPath(name).is_absolute() and ".." not in PurePosixPath(name).parts
@@ -77,16 +69,14 @@ def list_images(folder: str | Path, suffixes: tuple[str, ...] = IMAGE_SUFFIXES) 
 def find_pictures(folder: Path, names: Iterable[str]) -> dict[str, Path]:
     """The file of each name in a folder, as far as there is one: of this name, or the one that `Names` finds in its images."""
     wanted = list(names)
-    files = {name: folder / name for name in wanted if is_file(folder / name)}
+    files = {name: folder / name for name in wanted if os.path.isfile(folder / name)}
     lost = [name for name in wanted if name not in files]
     if lost:
         others = Names(name for name in list_images(folder) if name not in files)
-        taken = set(files.values())
-        pairs = [(name, file) for name in lost if (file := others.find(name)) is not None]
-        for name, file in sorted(pairs, key=lambda pair: folded_name(pair[0]) != folded_name(pair[1])):
-            if folder / file not in taken:  # two names that are one file: the nearer one has it
-                files[name] = folder / file
-                taken.add(folder / file)
+        pairs = [(name, file) for name in reversed(lost) if (file := others.find(name)) is not None]
+        pairs.sort(key=lambda pair: folded_name(pair[0]) == folded_name(pair[1]))
+        nearest = {file: name for name, file in pairs}  # two names that are one file: the nearer one has it
+        files |= {name: folder / file for file, name in nearest.items()}
     return files
 
 
@@ -100,6 +90,8 @@ def read_image(path: str | Path, background: str = "white") -> Tensor:  # [H, W,
     with open_picture(path, small=COLORS) as picture:
         picture.getexif().pop(ORIENTATION, None)  # Pillow would turn a TIFF
         if picture.mode.startswith(("I", "F")):
+            if "transparency" in picture.info:
+                raise ValueError("one of its 16-bit grey values is transparent: save it with an alpha channel")
             values = np.asarray(picture)
             if values.dtype.kind == "f" or values.min(initial=0) < 0 or values.max(initial=0) > 65535:
                 raise ValueError(f"its pixels are {values.dtype}, not whole numbers of at most 16 bits")
@@ -113,7 +105,7 @@ def read_image(path: str | Path, background: str = "white") -> Tensor:  # [H, W,
 
 def read_alpha(path: Path) -> Tensor | None:  # [H, W] float32 in [0, 1]
     """The opacity of a picture's pixels; None if all are opaque, or there is no such file."""
-    if not is_file(path):
+    if not os.path.isfile(path):
         return None
     with open_picture(path, small=COLORS) as picture:
         picture.getexif().pop(ORIENTATION, None)
@@ -123,11 +115,9 @@ def read_alpha(path: Path) -> Tensor | None:  # [H, W] float32 in [0, 1]
 
 def has_alpha(path: Path) -> bool:
     """Whether a file is a picture that may have transparent pixels, from its header."""
-    try:
-        with open_picture(path) as picture:
-            return _may_be_clear(picture)
-    except (OSError, SceneError):
-        return False
+    with suppress(OSError, SceneError), open_picture(path) as picture:
+        return _may_be_clear(picture)
+    return False
 
 
 def _may_be_clear(picture: Image.Image) -> bool:
@@ -247,8 +237,7 @@ def write_colmap_masks(folder: Path, photos: Mapping[str, tuple[Path, Path | Non
     if not any(mask is not None or has_alpha(photo) for photo, mask in photos.values()):
         return None
     for name, (photo, mask) in photos.items():
-        with open_picture(photo) as picture:
-            size = picture.height, picture.width
+        size = picture_size(photo)[::-1]
         alpha, kept = read_alpha(photo), torch.ones(size, dtype=torch.bool) if mask is None else read_mask(mask, size)
         kept = kept if alpha is None else kept & (alpha > 0.5)
         place = folder / f"{name}.png"

@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from .._arrays import Array
 from .._check import as_tensor, check_shapes
 from .._files import file_stem, folded_name
 from .._rows import check_finite
@@ -20,8 +21,6 @@ from ..cameras.camera import Camera
 from ..cameras.paths import robust_bounds
 from ..cameras.similarity import Similarity, fit_similarity
 from .files import SceneError, some
-
-Array = np.ndarray[Any, Any]
 
 MAX_ERROR = 0.03  # of the cameras' extent: two SfM runs of one scene differ by well below a hundredth
 MAX_ANGLE = 15.0  # degrees between a camera's two orientations, after alignment
@@ -66,9 +65,9 @@ class Alignment:
 
     def to_json(self) -> dict[str, Any]:
         """The similarity's matrix and every number, as plain lists and floats."""
-        facts = {"rms": self.rms, "rms of extent": self.rms / self.size, "inliers": self.inliers, "count": self.count}
         motion = {"matrix": self.similarity.matrix().tolist(), "scale": self.similarity.scale}
-        return {**motion, **facts, "left out": list(self.left_out)}
+        fit = {"rms": self.rms, "rms of extent": self.rms / self.size, "inliers": self.inliers, "count": self.count}
+        return {**motion, **fit, "left out": list(self.left_out)}
 
 
 def align_by_cameras(src: Sequence[Camera], dst: Sequence[Camera]) -> Alignment:
@@ -197,10 +196,7 @@ class FrameCheck(NamedTuple):
     drift: float  # how far the best fit nearby moves the surface of src, along its normals, world units
 
 
-def frames_agree(
-    src: Tensor,  # [N, 3]
-    dst: Tensor,  # [M, 3]
-) -> FrameCheck:
+def frames_agree(src: Tensor, dst: Tensor) -> FrameCheck:  # [N, 3], [M, 3]
     """Decide whether two clouds of one scene are in the same frame.
 
     A point is near when it is closer to the other cloud than 2 of that cloud's spacings (median distance to the next
@@ -213,10 +209,10 @@ def frames_agree(
     check_shapes(("src", src, "N 3"), ("dst", dst, "M 3"))
     a, b = _bulk("src", src), _bulk("dst", dst)
     size = min(float(np.linalg.norm(np.ptp(cloud, axis=0))) for cloud in (a, b))
-    trees = cKDTree(a), cKDTree(b)
-    spacings = [float(np.median(_nearest(tree, tree.data[:: max(1, tree.n // 5_000)], 2)[0][:, 1])) for tree in trees]
-    to_src, to_dst = (min(max(REACH_SPACINGS * one, REACH_SIZE * size), REACH_MOST * size) for one in spacings)
-    distances = _nearest(trees[1], a)[0], _nearest(trees[0], b)[0]
+    trees: list[Any] = [cKDTree(a), cKDTree(b)]
+    spacings = [float(np.median(tree.query(tree.data[:: max(1, tree.n // 5_000)], 2)[0][:, 1])) for tree in trees]
+    to_src, to_dst = (min(max(REACH_SPACINGS * spacing, REACH_SIZE * size), REACH_MOST * size) for spacing in spacings)
+    distances = trees[1].query(a)[0], trees[0].query(b)[0]
     near = float((distances[0] < to_dst).mean()), float((distances[1] < to_src).mean())
     drift = _drift(*(cloud[d < NEARBY * size] for cloud, d in zip((a, b), distances, strict=True)))
     most = DRIFT_MOST if min(near) >= BOTH_NEAR else DRIFT_SIZE
@@ -227,11 +223,6 @@ def frames_agree(
         f"{size:.3g}), and the best fit nearby moves their surface by {drift:.3g}"
     )
     return FrameCheck(agree, summary, near, drift)
-
-
-def _nearest(tree: cKDTree, places: Array, k: int = 1) -> tuple[Array, Array]:
-    distances, indices = tree.query(places, k=k)
-    return np.asarray(distances), np.asarray(indices)
 
 
 def _bulk(name: str, points: Tensor) -> Array:
@@ -253,12 +244,12 @@ def _drift(a: Array, b: Array) -> float:
     if min(len(a), len(b)) < FEWEST:
         return 0.0
     (a, m, tree_a), (b, n, tree_b) = _with_normals(a), _with_normals(b)
-    spacing = max(float(np.median(_nearest(tree, tree.data, 2)[0][:, 1])) for tree in (tree_a, tree_b))
+    spacing = max(float(np.median(tree.query(tree.data, 2)[0][:, 1])) for tree in (tree_a, tree_b))
     R, s, t = np.eye(3), 1.0, np.zeros(3)
     for reach in REACH_SPACINGS * spacing * np.geomspace(2, 0.5, 10):
         moved = s * a @ R.T + t
-        d, i = _nearest(tree_b, moved)
-        e, j = _nearest(tree_a, (b - t) @ R / s)
+        d, i = tree_b.query(moved)
+        e, j = tree_a.query((b - t) @ R / s)
         P, Q = np.concatenate([moved, moved[j]]), np.concatenate([b[i], b])
         normals = np.concatenate([n[i], m[j] @ R.T])
         squares, counts = np.concatenate([d**2, (e * s) ** 2]), np.repeat([len(d), len(e)], [len(d), len(e)])
@@ -276,7 +267,7 @@ def _drift(a: Array, b: Array) -> float:
     return float(np.quantile(np.abs((shift * m).sum(1)), DRIFT_SHARE))
 
 
-def _with_normals(points: Array) -> tuple[Array, Array, cKDTree]:
+def _with_normals(points: Array) -> tuple[Array, Array, Any]:
     """At most `FITTED` points, evenly over the surface (means of the cells of a grid), their normals, and a tree of them."""
     cell, low = float(np.ptp(points, axis=0).max()), points.min(0)
     thinned = points
@@ -289,7 +280,7 @@ def _with_normals(points: Array) -> tuple[Array, Array, cKDTree]:
             thinned = (np.stack(sums, axis=1) / counts[:, None])[chosen]
             break
         cell /= 1.1
-    tree = cKDTree(thinned)
-    near = thinned[_nearest(tree, thinned, min(12, len(thinned)))[1]]  # [n, k, 3]
+    tree: Any = cKDTree(thinned)
+    near = thinned[tree.query(thinned, min(12, len(thinned)))[1]]  # [n, k, 3]
     near = near - near.mean(1, keepdims=True)
     return thinned, np.linalg.eigh(np.einsum("nki,nkj->nij", near, near))[1][:, :, 0], tree

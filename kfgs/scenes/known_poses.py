@@ -12,7 +12,7 @@ import torch
 from scipy.spatial import cKDTree
 
 from .._files import real_path
-from ..cameras.camera import Camera
+from ..cameras.camera import Camera, exact_rotation
 from .files import SceneError
 from .scene import Scene, check_is_scene
 from .sfm import SfmConfig, SfmRun, sfm_run
@@ -112,8 +112,7 @@ def _reconstruction(pycolmap: Any, scene: Scene, names: list[str]) -> Any:
         camera = pycolmap.Camera(model=model, width=lens.width, height=lens.height, params=params, camera_id=i)
         camera.has_prior_focal_length = True
         known.add_camera_with_trivial_rig(camera)
-        view = lens.viewmat.double().numpy()
-        U, _, Vh = np.linalg.svd(view[:3, :3])  # float32 is not orthonormal enough
-        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(U @ Vh), view[:3, 3])
+        R = exact_rotation("viewmat", lens.viewmat[:3, :3]).numpy()  # float32 is not orthonormal enough
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(R), lens.viewmat[:3, 3].double().numpy())
         known.add_image_with_trivial_frame(pycolmap.Image(name=name, camera_id=i, image_id=i), pose)
     return known

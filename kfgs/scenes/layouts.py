@@ -27,15 +27,11 @@ def load_nice_slam(folder: Path) -> Scene:
     The last may be one level up. Its intrinsics count pixel centres from 0, so cx and cy grow by 0.5 here.
     """
     places = [folder / "cam_params.json", real_path(folder).parent / "cam_params.json"]
-    path = next((place for place in places if place.is_file()), None)
-    if path is None:
-        raise FileNotFoundError(
-            f"{places[1]}: no such file; expected the camera of the Replica scenes there or in {folder}: "
-            '{"camera": {"w": 1200, "h": 680, "fx": 600.0, "fy": 600.0, "cx": 599.5, "cy": 339.5, "scale": 6553.5}}'
-        )
+    path = next((place for place in places if place.is_file()), places[1])
+    example = '{"camera": {"w": 1200, "h": 680, "fx": 600.0, "fy": 600.0, "cx": 599.5, "cy": 339.5, "scale": 6553.5}}'
     names = ("w", "h", "fx", "fy", "scale", "cx", "cy")
     with scene_error(after=f"; {AGAIN}"):
-        top = read_json(path)
+        top = read_json(path, f"the camera of the Replica scenes, {example}, in {folder} or")
     try:
         width, height, fx, fy, scale, cx, cy = values = [top["camera"][name] for name in names]
         numbers = all(type(value) in (int, float) and abs(value) < MAX_NUMBER for value in values)  # NaN fails

@@ -15,8 +15,7 @@ from .colmap import load_colmap
 from .colmap_model import count_images, has_model
 from .files import SceneError, check_mask, folder_masks, natural_key, picture_folder, picture_size, some
 from .layouts import LAYOUTS, find_layout
-from .scene import Scene
-from .splits import RULES, choose_split, make_split, read_split
+from .scene import RULES, Scene, make_split, read_split
 from .transforms import load_transforms
 
 PLACES = ("sparse", "colmap/sparse", "dense/sparse", "distorted/sparse", "colmap_ground_truth", ".")
@@ -24,6 +23,7 @@ PLACES = ("sparse", "colmap/sparse", "dense/sparse", "distorted/sparse", "colmap
 PICTURES = ("images", "images_2", "images_4", "images_8", "color", "results", "rgb", "train", "val", "test")
 SCENE_PARTS = ("features", "sparse", "labels", "labels_scored", "masks", "depth", "pose", *PICTURES)
 """Folders of a scene that hold what it is read from."""
+LONG_VIDEO = 200  # frames of Replica: neighbours show the same, so that every tenth is enough
 SplitChoice = Literal["auto", "df3dgs", "feature3dgs", "holdout8", "all"]
 
 
@@ -96,13 +96,13 @@ def scene_root(path: Path) -> Path:
 def _load_views(path: Path, model: Path | None, images: Path | None) -> Scene:
     if model is not None:
         scene = load_colmap(model, images or _find_images(path, model))
-        counts = {other: f"{other.relative_to(path)} with {count_images(other)} images" for other in _models_of(path)}
-        used, others = counts.pop(model), some(list(counts.values()))
+        counts = {other.relative_to(path): count_images(other) for other in _models_of(path) if other != model}
         if not counts:
             return scene
-        advice = f"to use another, give its folder as the scene, as in {next(iter(counts))}"
-        note = f"{used} is used, the largest of several models; there is {others} too: {advice}"
-        return replace(scene, notes=(*scene.notes, note))
+        others = [f"{name}, which is damaged" if n is None else f"{name} with {n} images" for name, n in counts.items()]
+        used = f"{model.relative_to(path)} with {count_images(model)} images is used, the largest of several models"
+        advice = f"to use another, give its folder as the scene, as in {path / next(iter(counts))}"
+        return replace(scene, notes=(*scene.notes, f"{used}; there is {some(others)} too: {advice}"))
     if _is_transforms(path):
         return load_transforms(path, images)
     layout = find_layout(path)
@@ -111,7 +111,13 @@ def _load_views(path: Path, model: Path | None, images: Path | None) -> Scene:
     there = [(file, layout) for layout in LAYOUTS for file in layout.files if (path / file).exists()][:1]
     half = "".join(f" (there is {file}, but not all of {row.name}: {' and '.join(row.files)})" for file, row in there)
     what = "expected a COLMAP model, a transforms.json or the layout of a data set (docs/datasets.md), found none"
-    raise SceneError(f"{path}: {what}{half}; {_advice(path)}")
+    inside = [folder.name for folder in _folders(path)[:100] if is_scene(folder)]
+    advice = f"estimate the cameras first: `kfgs sfm {shlex.quote(str(path))} --out scene/`, or run_sfm"
+    if inside:
+        advice = f"it holds scenes ({some(inside)}): give one of them, as in {path / inside[0]}"
+    elif is_scene(real_path(path).parent):
+        advice = f"the folder above is a scene: give {real_path(path).parent}"
+    raise SceneError(f"{path}: {what}{half}; {advice}")
 
 
 def _is_transforms(path: Path) -> bool:
@@ -123,15 +129,6 @@ def is_scene(path: str | Path) -> bool:
     path = as_path(path)
     has_poses = path.is_dir() and (_is_transforms(path) or find_layout(path) is not None)
     return has_poses or find_model(path) is not None
-
-
-def _advice(path: Path) -> str:
-    inside = [folder.name for folder in _folders(path)[:100] if is_scene(folder)]
-    if inside:
-        return f"it holds scenes ({some(inside)}): give one of them, as in {path / inside[0]}"
-    if is_scene(real_path(path).parent):
-        return f"the folder above is a scene: give {real_path(path).parent}"
-    return f"estimate the cameras first: `kfgs sfm {shlex.quote(str(path))} --out scene/`, or run_sfm"
 
 
 def _find_images(root: Path, model: Path) -> Path:
@@ -156,8 +153,10 @@ def _with_split(scene: Scene, path: Path, root: Path, model: Path | None, split:
             return replace(scene, splits=chosen[0], notes=(*scene.notes, *chosen[1]))
         if scene.splits.get("test") or len(scene.splits["train"]) < len(scene):  # of its own lists
             return scene
-    layout = None if model is not None else find_layout(root)
-    rule = choose_split(len(scene), layout is not None and layout.video) if split == "auto" else split
+    layout, rule = None if model is not None else find_layout(root), split
+    if rule == "auto":
+        long_video = layout is not None and layout.video and len(scene) >= LONG_VIDEO
+        rule = "df3dgs" if long_video else "holdout8" if len(scene) >= 8 else "all"
     splits = make_split(len(scene), rule)
     note = f"split {rule}: {len(splits['train'])} of {len(scene)} views train, {len(splits['test'])} test"
     if not splits["train"]:
@@ -180,7 +179,7 @@ def _models_of(path: Path) -> list[Path]:
 
 def find_model(path: Path) -> Path | None:
     """The COLMAP model that `load_scene` reads in a scene folder, the one with most images; None if there is none."""
-    return max(_models_of(path), key=count_images, default=None)  # the first of equal ones
+    return max(_models_of(path), key=lambda model: count_images(model) or 0, default=None)  # the first of equal ones
 
 
 def _above(model: Path) -> list[Path]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -9,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from kornia.geometry.linalg import inverse_transformation
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -68,9 +70,7 @@ def mend_pose(pose: Matrix | None) -> tuple[Matrix | None, float | None]:  # [4,
     return mended, float(sizes.mean())
 
 
-def _as_large_as_pictures(
-    cameras: Sequence[Camera], paths: Sequence[Path], folder: Path | None = None
-) -> tuple[list[Camera], list[str]]:
+def _as_large_as_pictures(cameras: Sequence[Camera], paths: Sequence[Path]) -> tuple[list[Camera], list[str]]:
     """Each camera in the size of its own picture, which may be a resized copy (`images_4`), and a note if some are."""
     fitting = []
     for camera, path in zip(cameras, paths, strict=True):
@@ -83,7 +83,7 @@ def _as_large_as_pictures(
     other = [i for i, camera in enumerate(cameras) if camera is not fitting[i]]
     if not other:
         return fitting, []
-    where = folder.name if folder is not None and paths[0].is_relative_to(folder) else "images"
+    where = files.picture_folder(cameras[0].name, paths[0]).name
     ratio = cameras[other[0]].width / fitting[other[0]].width
     how = f"{paths[other[0]].name} is {max(ratio, 1 / ratio):.3g} times {'smaller' if ratio > 1 else 'larger'}"
     count = f"{len(other)} of {len(paths)} pictures have other sizes than the model says"
@@ -95,14 +95,12 @@ def scene_of_poses(
     views: Sequence[PosedPicture],
     points: tuple[Tensor, Tensor] | None = None,  # [P, 3] of the world, [P, 3] uint8
     notes: Sequence[str] = (),
-    images: Path | None = None,
     *,
     pictures: bool = True,
 ) -> Scene:
     """A scene of pictures with poses, all in the `train` split; views without a pose (not finite) are left out and noted.
 
-    Cameras get the size of their pictures, whose files need not be there without `pictures`. `images` is a folder that the user
-    gave, for a note.
+    Cameras get the size of their pictures, whose files need not be there without `pictures`.
     """
     cameras, kept, lost, scaled = list[Camera](), list[PosedPicture](), list[str](), dict[str, float]()
     for view in sorted(views, key=lambda view: natural_key(view.name)):
@@ -116,15 +114,15 @@ def scene_of_poses(
             if not np.allclose(pose[3], [0, 0, 0, 1], rtol=0, atol=1e-6):
                 row = "0 0 0 1 as its last row (if that is its last column, transpose it)"
                 raise ValueError(f"pose: expected {row}, got {pose[3].tolist()}")
-            viewmat, K = torch.from_numpy(inverse_pose(pose)), torch.from_numpy(view.K).float()
-            cameras.append(Camera(viewmat, K, *view.size, view.name, view.distortion))
+            viewmat = inverse_transformation(torch.from_numpy(pose)[None])[0]
+            cameras.append(Camera(viewmat, torch.from_numpy(view.K).float(), *view.size, view.name, view.distortion))
         kept.append(view)
     if not cameras:
         got = f"none in {len(views)} ({some(lost, 3)}); estimate them (`kfgs sfm`)"
         raise SceneError(f"{path}: expected poses and lenses of finite numbers, got {got}")
     paths, masks, told = [view.path for view in kept], [view.mask for view in kept], list(notes)
     if pictures:
-        cameras, resized = _as_large_as_pictures(cameras, paths, images)
+        cameras, resized = _as_large_as_pictures(cameras, paths)
         told += resized
     told += [NO_POINTS] if points is None else []
     if lost:
@@ -141,13 +139,6 @@ def scene_of_poses(
     with files.scene_error(f"{path}: "):  # names that do not differ
         scene = Scene(local, paths, recounted(places, ORIGIN, origin).float(), colors, splits, tuple(told))
     return replace(scene.with_near(), masks=masks if any(masks) else None)
-
-
-def inverse_pose(pose: Matrix) -> Matrix:  # [4, 4] -> [4, 4]
-    """The inverse of a rigid motion. `Camera` refuses what is not a rotation."""
-    inverse = np.eye(4)
-    inverse[:3, :3], inverse[:3, 3] = pose[:3, :3].T, -pose[:3, :3].T @ pose[:3, 3]
-    return inverse
 
 
 def to_number(word: str) -> float:
@@ -200,7 +191,7 @@ def points_from_depth(
     picture are left out; None if that are all. `unit` is world units per step. `K` are the intrinsics of the depth pictures;
     None takes those of each view, resized: picture and depth then show the same. A colour is that of the same place there.
     """
-    usable = [v for v in views if v.depth is not None and files.is_file(v.depth) and v.distortion is None]
+    usable = [v for v in views if v.depth is not None and os.path.isfile(v.depth) and v.distortion is None]
     pairs = [(view, pose) for view in usable if (pose := mend_pose(view.pose)[0]) is not None]
     if not pairs:
         return None

@@ -255,17 +255,19 @@ def _too_few(images: Path, sizes: list[int], names: list[str], config: SfmConfig
     if len(sizes) > 1:
         got = f"a scene split into {len(sizes)} unconnected models of {', '.join(map(str, sizes))} images"
     width, height = max((_size(images / name) for name in names), key=max)
-    small = f"these are small ({width}x{height} pixels)"
-    advice = {
-        f"use the original photos, or enlarge them to twice their size: {small}": 0 < max(width, height) < SMALL,
-        "take overlapping photos between the parts": True,
-        "use matching='exhaustive' (--matching exhaustive)": config.matching == "sequential",
-        "give single_camera=False (--no-single-camera) if several cameras took them, or zoom differs": config.single_camera,
-        "lower min_registered (--min-registered)": True,
-    }
+    advice = []
+    if 0 < max(width, height) < SMALL:
+        small = f"these are small ({width}x{height} pixels)"
+        advice.append(f"use the original photos, or enlarge them to twice their size: {small}")
+    advice.append("take overlapping photos between the parts")
+    if config.matching == "sequential":
+        advice.append("use matching='exhaustive' (--matching exhaustive)")
+    if config.single_camera:
+        advice.append("give single_camera=False (--no-single-camera) if several cameras took them, or zoom differs")
+    advice.append("lower min_registered (--min-registered)")
     return (
         f"expected at least {config.min_registered * len(names):.0f} of {len(names)} images registered in one model "
-        f"(min_registered = {config.min_registered:g}), got {got}; {', or '.join(words for words in advice if advice[words])}"
+        f"(min_registered = {config.min_registered:g}), got {got}; {', or '.join(advice)}"
     )
 
 

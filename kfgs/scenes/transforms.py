@@ -21,12 +21,10 @@ from torch import Tensor
 
 from .._files import Names, file_stem, read_json
 from ..cameras.camera import Distortion
-from . import files
 from .colmap import PANORAMA
-from .files import IMAGE_SUFFIXES, MAX_NUMBER, MAX_SIDE, SceneError, is_file, list_images, some
+from .files import IMAGE_SUFFIXES, MAX_NUMBER, MAX_SIDE, SceneError, list_images, picture_size, scene_error, some
 from .posed import MILLIMETRE, Matrix, PosedPicture, points_from_depth, read_points, scene_of_poses
-from .scene import Scene
-from .splits import split_by_lists
+from .scene import Scene, split_by_lists
 
 _LENSES = {  # the coefficients that each camera_model has
     **dict.fromkeys(("PINHOLE", "SIMPLE_PINHOLE"), ()),
@@ -75,9 +73,8 @@ class Frame:
             raise self.fail("", f"w and h of 1 to {MAX_SIDE} whole pixels", (width, height), "correct the size")
         fx, fy = self.focal_length("x", width), self.focal_length("y", height)
         if fx is None:
-            raise self.fail(
-                "", "'fl_x' or 'camera_angle_x'", sorted(self.values), "add one at the top, or to all frames"
-            )
+            advice = "add one at the top, or to all frames"
+            raise self.fail("", "'fl_x' or 'camera_angle_x'", sorted(self.values), advice)
         cx, cy = self.number("cx", width / 2), self.number("cy", height / 2)
         return np.array([[fx, 0, cx], [0, fx if fy is None else fy, cy], [0, 0, 1]]), (int(width), int(height))
 
@@ -138,7 +135,8 @@ class _Reader:
 
     root: Path
     images: Path | None
-    told: dict[str, list[str]] = field(default_factory=lambda: defaultdict(list))
+    missing: list[str] = field(default_factory=list)  # pictures that frames name
+    told: dict[str, list[str]] = field(default_factory=lambda: defaultdict(list))  # what else, and of which files
     names: dict[tuple[Path, bool], Names] = field(default_factory=dict)
 
     def read(self, path: Path, top: dict[str, Any], pictures: bool) -> list[PosedPicture]:
@@ -155,11 +153,11 @@ class _Reader:
                 raise frame.fail("file_path", expected, listed, "correct it, or take the frame out")
             file = self.find_image(listed, self.images)
             if file is None and pictures:
-                self.told["missing"].append(listed)
+                self.missing.append(listed)
                 continue
             if file is not None and not {"w", "h"} <= set(frame.values):
                 # Blender; a smaller copy in `images` is not what the file is about
-                frame.values["w"], frame.values["h"] = files.picture_size(self.find_image(listed, None) or file)
+                frame.values["w"], frame.values["h"] = picture_size(self.find_image(listed, None) or file)
             if file is None:
                 file = self.root / listed.replace("\\", "/")
                 file = file if file.suffix.lower() in IMAGE_SUFFIXES else file.with_name(f"{file.name}.png")
@@ -176,8 +174,7 @@ class _Reader:
         """The picture in a folder, or below it, that a name means."""
         if (folder, below) not in self.names:
             here = list_images(folder) if below else next(os.walk(folder), ("", [], []))[2]
-            pictures = [file for file in here if file.lower().endswith(IMAGE_SUFFIXES)]
-            self.names[folder, below] = Names(pictures, bare=below)
+            self.names[folder, below] = Names((f for f in here if f.lower().endswith(IMAGE_SUFFIXES)), bare=below)
         near = self.names[folder, below].find(name)
         return None if near is None else folder / near
 
@@ -186,11 +183,11 @@ class _Reader:
         name = listed.replace("\\", "/").removeprefix("./")
         if images is not None and (given := self.by_name(images, name)) is not None:
             return given
-        if Path(name).suffix.lower() in IMAGE_SUFFIXES and is_file(self.root / name):
+        if Path(name).suffix.lower() in IMAGE_SUFFIXES and os.path.isfile(self.root / name):
             return self.root / name
         file = self.by_name(self.root, name)
         if file is not None and name not in (near := file.relative_to(self.root).as_posix(), file_stem(near)):
-            self.told["respelled"].append(f"{listed} is {near}")
+            self.told["images were found by a name that is spelled otherwise"].append(f"{listed} is {near}")
         return file
 
     def find_mask(self, listed: Any) -> Path | None:
@@ -198,9 +195,9 @@ class _Reader:
         if listed is None:
             return None
         place = self.root / str(listed).replace("\\", "/").replace("\0", "")
-        mask = place if is_file(place) else self.by_name(place.parent, place.name, below=False)
+        mask = place if os.path.isfile(place) else self.by_name(place.parent, place.name, below=False)
         if mask is None:
-            self.told["unmasked"].append(f"{listed!r:.200}")
+            self.told["files of mask_path are missing, and those frames have no mask"].append(f"{listed!r:.200}")
         return mask
 
     def inside(self, listed: Any) -> Path | None:
@@ -208,7 +205,7 @@ class _Reader:
         if not isinstance(listed, str):
             return None
         file = self.root / listed.replace("\\", "/")
-        return file if _normal(file).is_relative_to(_normal(self.root)) and is_file(file) else None
+        return file if _normal(file).is_relative_to(_normal(self.root)) and os.path.isfile(file) else None
 
     def name(self, file: Path) -> str:
         """File name relative to `images/` of the scene, or else to the scene folder; for other files, the bare name."""
@@ -219,14 +216,13 @@ class _Reader:
 
     def notes(self, views: list[PosedPicture]) -> list[str]:
         """What was noticed, for people."""
-        masked, lost = sum(view.mask is not None for view in views), len(self.told["missing"])
-        words = {
-            "missing": f"of {lost + len(views)} frames have no image file",
-            "unmasked": "files of mask_path are missing, and those frames have no mask",
-            "respelled": "images were found by a name that is spelled otherwise",
-        }
-        told = [f"{len(names)} {words[what]}: {some(names)}" for what, names in self.told.items() if names]
-        return told + [f"masks: {masked} of {len(views)} frames have a mask_path; black is ignored"] * (masked > 0)
+        masked, lost = sum(view.mask is not None for view in views), len(self.missing)
+        told = [f"{len(names)} {what}: {some(names)}" for what, names in self.told.items()]
+        if lost:
+            told.append(f"{lost} of {lost + len(views)} frames have no image file: {some(self.missing)}")
+        if masked:
+            told.append(f"masks: {masked} of {len(views)} frames have a mask_path; black is ignored")
+        return told
 
 
 def load_transforms(path: Path, images: Path | None = None, *, pictures: bool = True) -> Scene:
@@ -244,20 +240,27 @@ def load_transforms(path: Path, images: Path | None = None, *, pictures: bool = 
     Image files are looked for in `images` before the scene folder; other sizes than the file says resize the cameras. Without
     `pictures` only cameras are read, also of frames without an image file; one without `file_path` is called `0007.png`.
     """
-    sources = _sources(path)
-    first, tops = next(iter(sources.values())), {split: _read_top(file) for split, file in sources.items()}
-    reader, top = _Reader(first.parent, images), tops[next(iter(sources))]
-    parts = {split: reader.read(file, tops[split], pictures) for split, file in sources.items()}
+    sources, parts, tops = _sources(path), dict[str, list[PosedPicture]](), list[Any]()
+    first = next(iter(sources.values()))
+    reader = _Reader(first.parent, images)
+    for split, file in sources.items():
+        with scene_error(after="; correct it there"):
+            top = read_json(file)
+        if not isinstance(top, dict) or not isinstance(top.get("frames"), list) or not top["frames"]:
+            expected = "an object with a list of 'frames'"
+            raise Frame(file, "top level", {}).fail("", expected, top, "is this a transforms.json?")
+        parts[split] = reader.read(file, top, pictures)
+        tops.append(top)
+    top = tops[0]
     views = [view for part in parts.values() for view in part]
     if not views:
-        missing = reader.told["missing"]
-        got = f"none of {len(missing)} has one ({some(missing, 3)})"
+        got = f"none of {len(reader.missing)} has one ({some(reader.missing, 3)})"
         advice = "copy the images next to the file or pass their folder"
         raise SceneError(f"{path}: expected frames with image files, {got}; {advice}")
     if not pictures:
         return scene_of_poses(path, views, notes=reader.notes(views), pictures=False)
     points, told = _points(reader, first, top, views)
-    scene = scene_of_poses(path, views, points, [*reader.notes(views), *told], images)
+    scene = scene_of_poses(path, views, points, [*reader.notes(views), *told])
     names = [camera.name for camera in scene.cameras]
     lists = {name: top.get(f"{name}_filenames") for name in ("train", "val", "test")}
     if "all" not in sources:
@@ -274,17 +277,7 @@ def _sources(path: Path) -> dict[str, Path]:
     if not path.is_dir() or (path / "transforms.json").is_file():
         return {"all": path / "transforms.json" if path.is_dir() else path}
     parts = {name: path / f"transforms_{name}.json" for name in ("train", "test", "val")}
-    needed = {name: file for name, file in parts.items() if file.is_file()}
-    return {name: file for name, file in needed.items() if name != "val" or "test" not in needed}
-
-
-def _read_top(path: Path) -> dict[str, Any]:
-    with files.scene_error(after="; correct it there"):
-        top = read_json(path)
-    if not isinstance(top, dict) or not isinstance(top.get("frames"), list) or not top["frames"]:
-        expected = "an object with a list of 'frames'"
-        raise Frame(path, "top level", {}).fail("", expected, top, "is this a transforms.json?")
-    return top
+    return {name: f for name, f in parts.items() if f.is_file() and not (name == "val" and parts["test"].is_file())}
 
 
 def _normal(path: Path) -> Path:
@@ -297,7 +290,7 @@ def _points(
 ) -> tuple[tuple[Tensor, Tensor] | None, list[str]]:
     """Points and colours in the frame of the poses, and notes."""
     notes, listed = list[str](), top.get("ply_file_path")
-    if listed is None and is_file(reader.root / _UNNAMED_POINTS):
+    if listed is None and os.path.isfile(reader.root / _UNNAMED_POINTS):
         listed = _UNNAMED_POINTS
         notes = [f"points of {listed}, which no file names: 3DGS and OpenGaussian write it; random for Blender scenes"]
     file = reader.inside(listed)

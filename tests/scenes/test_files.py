@@ -11,7 +11,7 @@ from messages import tells
 from PIL import Image
 
 from kfgs.scenes import SceneError, read_image
-from kfgs.scenes.files import picture_size
+from kfgs.scenes.files import picture_size, read_alpha
 from kfgs.scenes.posed import read_depth
 
 RNG = np.random.default_rng(0)
@@ -75,6 +75,18 @@ def test_pixels_that_are_no_colours_are_named(tmp_path):
     Image.fromarray(COLORS[..., 0].astype(np.float32)).save(tmp_path / "a.tif")
     with pytest.raises(SceneError, match=tells("a.tif", "float32", "16 bits", "replace the file")):
         read_image(tmp_path / "a.tif")
+
+
+def test_a_transparent_value_of_16_bit_grey_is_refused_with_what_helps(tmp_path):
+    grey = Image.fromarray(np.arange(35, dtype=np.uint16).reshape(5, 7) * 1000)
+    grey.save(tmp_path / "a.png", transparency=3000)
+    with pytest.raises(SceneError, match=tells("a.png", "16-bit grey", "transparent", "save it with an alpha channel")):
+        read_image(tmp_path / "a.png")
+    clear = np.array(np.asarray(grey) == 3000)
+    pixels = np.stack([np.asarray(grey) // 257, np.where(clear, 0, 255)], -1).astype(np.uint8)
+    Image.fromarray(pixels, "LA").save(tmp_path / "a.png")  # what helps
+    assert np.array_equal((read_image(tmp_path / "a.png", "white") == 1).all(-1), clear)
+    assert np.array_equal(read_alpha(tmp_path / "a.png") == 0, clear)
 
 
 def png(width: int, height: int, rows: bytes) -> bytes:

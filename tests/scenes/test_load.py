@@ -80,6 +80,29 @@ def test_of_several_models_the_largest_is_used(
     assert advised.splits["train"] == [models[other] - 1]
 
 
+@pytest.mark.parametrize("text", [False, True])
+def test_a_damaged_model_among_several_is_told(tmp_path: Path, text: bool) -> None:
+    names = [f"{i}.png" for i in range(9)]
+    write_model(tmp_path / "sparse/0", names[:2], text=text)
+    write_model(tmp_path / "sparse/1", names, text=text)
+    file = tmp_path / "sparse/1" / ("images.txt" if text else "images.bin")
+    file.write_bytes(b"\xff" * 99 if text else file.read_bytes()[:600])
+    _pictures(tmp_path / "images", names)
+    (note,) = (note for note in load_scene(tmp_path).notes if "of several models" in note)
+    assert "sparse/0 with 2 images is used" in note
+    assert "there is sparse/1, which is damaged too" in note
+    with pytest.raises(SceneError, match=tells(file.name, "truncated or damaged")):  # the advice leads to the reason
+        load_scene(note.rpartition("as in ")[2])
+
+
+@pytest.mark.parametrize(("count", "rule"), [(7, "all"), (8, "holdout8")])
+def test_the_rule_without_a_split_file(tmp_path: Path, count: int, rule: str) -> None:
+    names = [f"{i}.png" for i in range(count)]
+    write_model(tmp_path / "sparse/0", names)
+    _pictures(tmp_path / "images", names)
+    assert any(note.startswith(f"split {rule}:") for note in load_scene(tmp_path).notes)
+
+
 def test_pictures_beside_a_dense_model_are_its_own(tmp_path: Path) -> None:
     write_model(tmp_path / "dense/sparse", ["a.png"])
     _pictures(tmp_path / "images", ["a.png"])

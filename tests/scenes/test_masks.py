@@ -79,6 +79,20 @@ def test_a_mask_has_the_name_of_its_photo_in_any_spelling(tmp_path):
     assert scene.select(["b.jpg"]).masks == [tmp_path / "masks/b.jpg"]
 
 
+def test_photos_that_differ_by_case_alone_have_their_own_masks(tmp_path):
+    make_scene(tmp_path, ["a.jpg", "A.jpg"])
+    if len(list_images(tmp_path / "images")) < 2:
+        pytest.skip("this disk does not tell upper case from lower case")
+    for names in (["A.png", "a.png"], ["A.jpg.png", "a.jpg.png"]):
+        for name in names:
+            save(tmp_path / "masks" / name, KEPT.astype(np.uint8) * 255)
+        scene = load_scene(tmp_path)
+        given = {camera.name: mask.name for camera, mask in zip(scene.cameras, scene.masks, strict=True)}
+        assert given == {"A.jpg": names[0], "a.jpg": names[1]}
+        for name in names:
+            (tmp_path / "masks" / name).unlink()
+
+
 def test_names_that_match_nothing_are_told(tmp_path):
     make_scene(tmp_path, ["a.png", "b.png"])
     save(tmp_path / "masks/c.png", KEPT.astype(np.uint8))

@@ -87,11 +87,12 @@ def test_select_by_split_name_stem_and_index(tmp_path: Path) -> None:
     assert chosen.splits == {"train": [1], "test": [0]}
     assert chosen.image_paths[0].name == "rgb_10.png"
     assert len(scene.select([2])) == 1
+    assert len(scene.select("all")) == 3
     assert [c.name for c in scene.select(["RGB_10.JPG", "images\\rgb_0.png"]).cameras] == ["rgb_10.png", "rgb_0.png"]
     for order in (range(1, 3), torch.tensor([1, 2]), np.array([1, 2])):
         assert scene.select(order).splits == {"train": [0], "test": [1]}
     for which, message in (
-        ("val", ("which:", "['test', 'train']", "got 'val'", "list")),
+        ("val", ("split:", "train, test, all", "got 'val'", "list")),
         (["rgb_1"], ("which:", "got 'rgb_1'", "did you mean 'rgb_10.png'?")),
         ([3], ("which:", "3 views", "got 3")),
         ([-1], ("which:", "3 views", "got -1")),

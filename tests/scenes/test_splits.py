@@ -6,7 +6,7 @@ from messages import tells
 
 from kfgs.scenes import SceneError
 from kfgs.scenes.files import natural_key
-from kfgs.scenes.splits import choose_split, make_split, read_split
+from kfgs.scenes.scene import make_split, read_split
 
 
 def test_the_papers_split_takes_every_10th_from_the_1st_and_6th() -> None:
@@ -20,15 +20,6 @@ def test_holdout8_and_all() -> None:
     split = make_split(17, "holdout8")
     assert split == {"train": [1, 2, 3, 4, 5, 6, 7, 9, 10, 11, 12, 13, 14, 15], "test": [0, 8, 16]}
     assert make_split(3, "all") == {"train": [0, 1, 2], "test": []}
-
-
-@pytest.mark.parametrize(
-    ("count", "video", "rule"),
-    [(0, False, "all"), (7, True, "all"), (8, False, "holdout8"), (500, False, "holdout8"), (199, True, "holdout8"),
-     (200, True, "df3dgs")],
-)  # fmt: skip
-def test_the_rule_without_a_split_file(count: int, video: bool, rule: str) -> None:
-    assert choose_split(count, video) == rule
 
 
 def test_numbers_sort_as_numbers() -> None:
@@ -91,8 +82,10 @@ def test_unknown_names_of_a_list_are_told_and_lists_without_a_view_refused(tmp_p
     names = ["a.png", "b.png"]
     assert read_split(tmp_path, names) is None
     (tmp_path / "test.txt").write_text("b.png\nframe_b.png\n")
+    (tmp_path / "val.txt").write_text("frame_b.png\n")  # named once
     splits, notes = read_split(tmp_path, names) or ({}, [])
-    assert splits == {"train": [0], "test": [1]}
+    (tmp_path / "val.txt").unlink()
+    assert splits == {"train": [0], "val": [], "test": [1]}
     assert "1 names" in notes[0]
     assert notes[0].endswith("test.txt are not in the scene: frame_b.png (did you mean 'b.png'?)")
     for text in ("frame_1.png", "a.png\nb.png"):
