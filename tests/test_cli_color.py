@@ -11,9 +11,10 @@ from cases_color import SH0, surface
 from PIL import Image
 
 import kfgs.pipeline.color
+from kfgs import Gaussians
 from kfgs.cli import main
 from kfgs.fields import SemanticField, fuse_views
-from kfgs.formats import read_splats
+from kfgs.formats import read_splats, write_splats
 from kfgs.formats.ply import read_ply
 from kfgs.labels import connected_parts, load_label_set
 from kfgs.labels.components import part_distance
@@ -183,6 +184,21 @@ def test_convert_by_class_writes_a_plain_file_for_each_class(labelled, tmp_path,
         assert {"class_id", "score"}.isdisjoint(read_ply(out / name))
         assert name in said
     assert "note:" not in said
+
+
+def test_convert_by_class_tells_the_losses_of_every_class(tmp_path, capsys):
+    cloud = Gaussians(
+        means=torch.rand(9, 3), quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(9, 1), scales=torch.full((9, 3), 0.1),
+        opacities=torch.full((9,), 0.5), sh=torch.zeros(9, 1, 3), labels=torch.arange(9) % 3, names=("wall", "chair", "sofa"),
+    )  # fmt: skip
+    write_splats(cloud.replace(origin=(5e5, 4e6, 0.0)), tmp_path / "far.ply")
+    assert main(["convert", str(tmp_path / "far.ply"), str(tmp_path / "objects"), "--by-class"]) == 0
+    notes = [line for line in capsys.readouterr().out.splitlines() if "relative to the origin" in line]
+    assert [re.findall(r"coordinates of (\S+) are", note) for note in notes] == [
+        ["00_wall.ply"],
+        ["01_chair.ply"],
+        ["02_sofa.ply"],
+    ]
 
 
 def test_all_photographs_can_be_used_and_none_is_left_to_score(room, splat, tmp_path, capsys):

@@ -232,15 +232,16 @@ def _convert_by_class(source: Path, folder: Path) -> None:
     parts = {}
     for label, part in splats.by_class().items():  # numbers keep names apart that a file's name cannot hold
         word = re.sub(r"[^\w-]+", "_", splats.names[label] if 0 <= label < len(splats.names) else "").strip("_")[:80]
-        parts[f"{label:02d}{word and '_'}{word}.ply" if label >= 0 else "unlabelled.ply"] = part
+        plain = part.replace(labels=None, scores=None)
+        parts[f"{label:02d}{word and '_'}{word}.ply" if label >= 0 else "unlabelled.ply"] = plain
     if any((folder / name).is_file() and (folder / name).samefile(source) for name in parts):
         raise ValueError(f"target: expected another folder than that of {source}, which is read; give another name")
     with atomic_folder(folder) as new:
-        for name, part in parts.items():
-            written = kfgs.write_splats(part.replace(labels=None, scores=None), new / name, plain=True)
+        written = [kfgs.write_splats(part, new / name, plain=True) for name, part in parts.items()]
     for name, part in parts.items():
         say(f"{name}: {len(part)} Gaussians")
-    say_lost(written)
+    for words in dict.fromkeys(words for file in written for words in file.lost):
+        say(f"note: {words}")
     wrote([folder / name for name in parts])
 
 

@@ -46,9 +46,8 @@ _LEAST_BYTES = 8  # bytes per Gaussian: with fewer, the file shows one buffer ma
 
 def matches(head: bytes) -> bool:
     """A .glb, or JSON that mentions accessors or the extension."""
-    if head.startswith(GLB):
-        return True
-    return head.lstrip()[:1] == b"{" and (EXTENSION.encode() in head or b'"accessors"' in head)
+    is_json = head.lstrip()[:1] == b"{"
+    return head.startswith(GLB) or (is_json and (EXTENSION.encode() in head or b'"accessors"' in head))
 
 
 def read(path: Path) -> Gaussians:
@@ -118,8 +117,7 @@ def _read_primitive(path: Path, document: Document, primitive: dict[str, Any]) -
         raise ValueError(f"expected points, kernel {_WRITTEN['kernel']!r} and no further extension, got {got:.60}")
     for key in ("colorSpace", "projection"):
         if extension.get(key, _WRITTEN[key]) != _WRITTEN[key]:
-            said = f"the file says {key} {extension[key]!r:.80}"
-            tell(f"{path.name}: {said}: drawn as if it were {_WRITTEN[key]!r}")
+            tell(f"{path.name}: the file says {key} {extension[key]!r:.80}: drawn as if it were {_WRITTEN[key]!r}")
     means = document.values(attributes["POSITION"], 3, None)
     quats, scales, opacities = (
         document.values(attributes[f"{EXTENSION}:{name}"], width, len(means))

@@ -10,6 +10,7 @@ import base64
 import json
 import math
 import struct
+import unicodedata
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -83,7 +84,9 @@ class Document:
             if not head.endswith(";base64"):
                 raise ValueError(f"a uri begins with {uri[:40]!r}, expected data:...;base64,...")
             return base64.b64decode(text, validate=True)
-        file = real_path(self._folder / unquote(uri))
+        name = unquote(uri)
+        plain = [unicodedata.normalize(form, name.replace("\\", "/")) for form in ("NFC", "NFD")]  # a Mac's zip has NFD
+        file = next(filter(Path.is_file, (real_path(self._folder / way) for way in (name, *plain))), self._folder)
         if urlsplit(uri).scheme or not file.is_relative_to(self._folder) or not file.is_file():
             raise ValueError(f"the uri {uri!r:.60} is not a file in its folder; copy it there, or write .glb")
         with file.open("rb") as handle:
@@ -139,8 +142,7 @@ def _read_chunks(path: Path) -> tuple[bytes, bytes]:
     _, version, length = _HEAD.unpack_from(data)
     if version != 2 or length > len(data):
         raise ValueError(f"a .glb of version {version} and {length} bytes, expected version 2 and {len(data)}")
-    chunks: dict[int, bytes] = {}
-    place = _HEAD.size
+    chunks, place = dict[int, bytes](), _HEAD.size
     while place + _CHUNK.size <= length:
         size, kind = _CHUNK.unpack_from(data, place)
         place += _CHUNK.size

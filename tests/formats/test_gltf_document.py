@@ -4,6 +4,7 @@ import base64
 import json
 import struct
 import tracemalloc
+import unicodedata
 
 import numpy as np
 import pytest
@@ -29,6 +30,21 @@ def test_a_buffer_beside_the_document_is_read(tmp_path):
     (tmp_path / "my data.bin").unlink()
     with pytest.raises(ValueError, match=tells("bent.gltf:", "my%20data.bin")):
         read_splats(path)
+
+
+@pytest.mark.parametrize("form", ["NFC", "NFD"])
+def test_a_buffer_is_found_under_other_slashes_and_in_another_unicode_form(tmp_path, form):
+    cloud = random_cloud(5, 1)
+    path = bent_gltf(tmp_path, cloud)
+    root = json.loads(path.read_text())
+    blob = base64.b64decode(root["buffers"][0]["uri"].partition(",")[2])
+    file = tmp_path / unicodedata.normalize(form, "K\u00fcche/data.bin")
+    file.parent.mkdir()
+    file.write_bytes(blob)
+    for uri in ("K\u00fcche/data.bin", "Ku\u0308che/data.bin", "K%C3%BCche/data.bin", "K\u00fcche\\data.bin"):
+        root["buffers"][0]["uri"] = uri
+        path.write_text(json.dumps(root))
+        assert torch.equal(read_splats(path).means, cloud.means), uri
 
 
 @pytest.mark.parametrize(
