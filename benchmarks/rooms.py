@@ -24,13 +24,13 @@ import json
 import os
 import time
 import xml.etree.ElementTree as ET
-from collections.abc import Callable
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from PIL import Image
-from rooms_path import Array, Lens, free_places, test_views, training_path
+from rooms_path import Array, Lens, plan_views
 
 VOID = 255
 LAYERS = 8  # masked surfaces (leaves) that a ray may pass
@@ -54,47 +54,44 @@ def write(path: Path, value: Any) -> None:
 class Things:
     """What the shapes of a scene are: `classes`, `instances`, and the ids of each part (a mesh, or its top)."""
 
-    def __init__(self, about: dict[str, Any], shapes: list[str]) -> None:
-        classes = about["things"]
-        self.classes = [name for name in classes if name != "void"]
-        self.instances = [(f"{name} {k + 1}", name) for name in self.classes for k in range(len(classes[name]))]
-        self.meshes = {f"{name} {k + 1}": meshes for name in classes for k, meshes in enumerate(classes[name])}
-        owner = {mesh: thing for thing, meshes in self.meshes.items() for mesh in meshes}
-        unknown = sorted({mesh.removesuffix(TOP) for mesh in owner} - set(shapes))
-        missing = sorted(set(shapes) - set(owner))
-        if unknown or missing:
-            raise SystemExit(
-                f"the scene's shapes differ from its JSON: {unknown} are not there, {missing} have no class"
-            )
-        place = {name: i for i, (name, _) in enumerate(self.instances)}
+    def __init__(self, table: dict[str, list[list[str]]], shapes: list[str], removed: Sequence[str] = ()) -> None:
+        self.classes = [name for name in table if name != "void"]
+        self.meshes = {f"{name} {k + 1}": meshes for name in table for k, meshes in enumerate(table[name])}
+        self.instances = [name for name in self.meshes if not name.startswith("void ")]
+        owner = {mesh: name for name, meshes in self.meshes.items() for mesh in meshes}
+        unknown = sorted({mesh.removesuffix(TOP) for mesh in owner} - {*shapes, *removed})
+        if unknown or (missing := sorted(set(shapes) - set(owner))):
+            raise SystemExit(f"the JSON of the scene: expected its shapes, got {unknown or f'no class of {missing}'}")
         parts = [owner.get(name + end, owner[name]) for name in shapes for end in ("", TOP)]
-        ids = [place.get(thing, VOID) for thing in parts]
-        self.instance_ids = np.array([*ids, VOID], np.uint8)  # the last: nothing was hit
-        of = [self.classes.index(name) for _, name in self.instances]
-        self.class_ids = np.array([VOID if i == VOID else of[i] for i in [*ids, VOID]], np.uint8)
+        known = {name: (k, self.classes.index(class_of(name))) for k, name in enumerate(self.instances)}
+        ids = np.array([*(known.get(name, (VOID, VOID)) for name in parts), (VOID, VOID)], np.uint8)  # nothing hit: -1
+        self.instance_ids, self.class_ids = ids.T
 
     def named(self, names: list[str]) -> list[str]:
         """The meshes of things, by instance ("chair 2") or class ("chair")."""
-        known = {*self.classes, *self.meshes}
-        if wrong := [name for name in names if name not in known]:
-            raise SystemExit(f"--without: expected things of {', '.join(sorted(known))}; got {', '.join(wrong)}")
-        return [m for name, meshes in self.meshes.items() if {name, name.rsplit(" ", 1)[0]} & {*names} for m in meshes]
+        if wrong := [name for name in names if name not in (*self.classes, *self.instances)]:
+            known = ", ".join([*self.classes, *self.instances])
+            raise SystemExit(f"--without: expected things of {known}; got {', '.join(wrong)}")
+        return [mesh for name in self.instances if {name, class_of(name)} & {*names} for mesh in self.meshes[name]]
 
 
-def mend(folder: Path) -> ET.Element:
+def class_of(instance: str) -> str:
+    """The class of an instance: "chair" of "chair 2"."""
+    return instance.rsplit(" ", 1)[0]
+
+
+def mend(folder: Path, removed: Sequence[str] = ()) -> ET.Element:
     """The scene file of Mitsuba 0.6 as 3.9 reads it, with an id for each shape: its mesh's name, or kind and number."""
     root = ET.parse(folder / "scene.xml").getroot()
-    values = {e.get("name"): e.get("value", "") for e in root.findall("default")}
-    for number, e in enumerate([e for e in root if e.tag == "shape"]):
-        name = e.find("string[@name='filename']")
-        e.set("id", f"{e.get('type')}{number}" if name is None else Path(name.get("value", "")).stem)
-        if name is not None and not (folder / name.get("value", "")).exists():
+    for number, e in enumerate(root.findall("shape")):
+        mesh = e.find("string[@name='filename']")
+        e.set("id", f"{e.get('type')}{number}" if mesh is None else Path(mesh.get("value", "")).stem)
+        if e.get("id") in removed or (mesh is not None and not (folder / mesh.get("value", "")).exists()):
             root.remove(e)
     for e in [e for e in root if e.tag in ("default", "integrator", "sensor")]:
         root.remove(e)
     for e in root.iter():
         value = e.get("value", "")
-        e.attrib.update({key: values[text[1:]] for key, text in e.attrib.items() if text.startswith("$")})
         if e.get("name") == "filename":
             e.set("value", str((folder / value).resolve()))
         if value == "trilinear":
@@ -102,35 +99,28 @@ def mend(folder: Path) -> ET.Element:
         if e.tag in ("rgb", "srgb") and value.startswith("#"):
             e.tag = "rgb"
             e.set("value", ", ".join(str((int(value[i : i + 2], 16) / 255) ** 2.2) for i in (1, 3, 5)))
+        old = {"extEta", "sunRadiusScale"}
         if e.get("type") == "roughdiffuse":
             e.set("type", "diffuse")
-        kept = ("reflectance", "diffuseReflectance") if e.tag == "bsdf" and e.get("type") == "diffuse" else None
-        for child in list(e):
-            name = child.get("name")
-            if name in ("extEta", "sunRadiusScale") or (kept and name == "alpha"):
-                e.remove(child)
+            old |= {"alpha", "useFastApprox"}
+        for child in [child for child in e if child.get("name") in old]:
+            e.remove(child)
     return root
 
 
 class Room:
     """A scene in Mitsuba, asked in metres with z up."""
 
-    def __init__(self, folder: Path, about: dict[str, Any], removed: list[str] | None = None) -> None:
+    def __init__(self, folder: Path, metres_per_unit: float, removed: Sequence[str] = ()) -> None:
         import drjit as dr
         import mitsuba as mi
 
-        root = mend(folder)
-        for e in [e for e in root if e.tag == "shape" and e.get("id") in (removed or [])]:
-            root.remove(e)
-        self.scene = mi.load_string(ET.tostring(root, encoding="unicode"), optimize=False)  # keeps the shapes apart
+        text = ET.tostring(mend(folder, removed), encoding="unicode")
+        self.scene, self.unit = mi.load_string(text, optimize=False), metres_per_unit  # optimize would join shapes
         self.shapes = [shape.id() for shape in self.scene.shapes()]
-        boxes = [(shape.bbox().min.y, shape.bbox().max.y) for shape in self.scene.shapes()]
-        self.tops = np.array([high - 0.1 * (high - low) for low, high in boxes])
-        self.unit = float(about["metres_per_unit"])
+        self.tops = np.array([0.9 * s.bbox().max.y + 0.1 * s.bbox().min.y for s in self.scene.shapes()])
         self.to_scene = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # z up to y up
-        registered = np.array(
-            dr.reinterpret_array(mi.UInt32, self.scene.shapes_dr())
-        )  # in the order of loading threads
+        registered = np.array(dr.reinterpret_array(mi.UInt32, self.scene.shapes_dr()))  # as threads loaded them
         self.place = np.full(int(registered.max()) + 1, -1)
         self.place[registered] = np.arange(len(registered))
 
@@ -153,9 +143,8 @@ class Room:
         distance, part, rest = np.full(len(origins), np.inf), np.full(len(origins), -1), np.arange(len(origins))
         passed = np.zeros(len(origins))
         for _ in range(LAYERS):
-            hit = self.scene.ray_intersect(
-                self.rays(origins[rest] + directions[rest] * passed[:, None], directions[rest])
-            )
+            starts = origins[rest] + directions[rest] * passed[:, None]
+            hit = self.scene.ray_intersect(self.rays(starts, directions[rest]))
             valid, solid = np.array(hit.is_valid()), np.array(hit.bsdf().eval_null_transmission(hit)[0]) < 0.5
             shape = self.place[np.array(dr.reinterpret_array(mi.UInt32, hit.shape))]
             top = (np.abs(np.array(hit.n.y)) > 0.7) & (np.array(hit.p.y) > self.tops[shape])
@@ -187,20 +176,6 @@ class Room:
         return np.round(np.clip(light, 0, 1) ** (1 / 2.2) * 255).astype(np.uint8)
 
 
-def make_plan(
-    distances: Callable[[Array, Array], Array], lens: Lens, inside: Array, options: dict[str, Any]
-) -> dict[str, Any]:
-    """The poses of all views by stem: {"options", "views": {stem: [4, 4]}}."""
-    rng = np.random.default_rng(options["seed"])
-    free = free_places(distances, inside)
-    train = training_path(distances, lens, free, options["train"], rng)
-    test = test_views(distances, lens, free, train, options["test"], rng)
-    named = {f"train_{i:03d}": pose for i, pose in enumerate(train)} | {
-        f"test_{i:03d}": pose for i, pose in enumerate(test)
-    }
-    return {"options": options, "views": {stem: pose.tolist() for stem, pose in named.items()}}
-
-
 def render_view(room: Room, things: Things, lens: Lens, pose: Array, out: Path, stem: str, **light: Any) -> None:
     """The four files of a view, its picture last."""
     origins, directions, lengths = lens.rays(pose)
@@ -213,11 +188,10 @@ def render_view(room: Room, things: Things, lens: Lens, pose: Array, out: Path, 
     write(out / "images" / f"{stem}.png", room.picture(lens, pose, **light))
 
 
-def write_scene(out: Path, lens: Lens, plan: dict[str, Any], things: Things) -> None:
+def write_scene(out: Path, lens: Lens, poses: dict[str, Array], things: Things, seed: int) -> None:
     """Cameras, split, names and points of a folder whose views are all made."""
-    poses = {stem: np.array(pose) for stem, pose in plan["views"].items()}
     train = [stem for stem in poses if stem.startswith("train")]
-    rng, points, colors = np.random.default_rng([plan["options"]["seed"], 1]), [], []
+    rng, points, colors = np.random.default_rng([seed, 1]), [], []
     for stem in train:
         depth = np.load(out / "depth" / f"{stem}.npy").ravel()
         rows = rng.choice(len(depth), -(-POINTS // len(train)))
@@ -227,64 +201,33 @@ def write_scene(out: Path, lens: Lens, plan: dict[str, Any], things: Things) -> 
         colors.append(np.array(Image.open(out / "images" / f"{stem}.png")).reshape(-1, 3)[rows])
     table = np.concatenate([np.concatenate(points), np.concatenate(colors)], 1)
     table[:, :3] += rng.normal(0, POINT_NOISE, (len(table), 3))
-    kinds = [f"property float {axis}" for axis in "xyz"] + [
-        f"property uchar {name}" for name in ("red", "green", "blue")
-    ]
+    kinds = [f"property float {axis}" for axis in "xyz"]
+    kinds += [f"property uchar {color}" for color in ("red", "green", "blue")]
     lines = ["ply", "format ascii 1.0", f"element vertex {len(table)}", *kinds, "end_header"]
     lines += [f"{x:.4f} {y:.4f} {z:.4f} {r:.0f} {g:.0f} {b:.0f}" for x, y, z, r, g, b in table]
     write(out / "points.ply", "\n".join([*lines, ""]))
     write(out / "classes.json", things.classes)
-    write(out / "instances.json", [{"name": name, "class": kind} for name, kind in things.instances])
+    write(out / "instances.json", [{"name": name, "class": class_of(name)} for name in things.instances])
     write(out / "split.json", {"train": train, "test": [stem for stem in poses if stem not in train]})
     opengl = np.diag([1.0, -1.0, -1.0, 1.0])  # x right, y up, z backward
-    frames = [
-        {"file_path": f"images/{s}.png", "transform_matrix": (pose @ opengl).tolist()} for s, pose in poses.items()
-    ]
+    frames = [{"file_path": f"images/{s}.png", "transform_matrix": (p @ opengl).tolist()} for s, p in poses.items()]
     numbers = {"w": lens.width, "h": lens.height, "fl_x": lens.focal, "fl_y": lens.focal}
     numbers |= {"cx": lens.width / 2, "cy": lens.height / 2}
     write(out / "transforms.json", {**numbers, "ply_file_path": "points.ply", "frames": frames})
-
-
-def agreement(out: Path, lens: Lens, views: dict[str, Any]) -> tuple[float, int]:
-    """Whether a place has one class in all views: the share of pixels, and their number.
-
-    A pixel counts if another view shows its place (z-depth within 1 %), and the pixels around it have one class in both.
-    """
-    right = total = 0
-    shown = {}
-    for stem in views:
-        labels = np.pad(np.array(Image.open(out / "labels" / f"{stem}.png")), 2, constant_values=VOID)
-        around = np.lib.stride_tricks.sliding_window_view(labels, (5, 5))
-        inner = (around.min((2, 3)) == around.max((2, 3))) & (labels[2:-2, 2:-2] != VOID)
-        shown[stem] = labels[2:-2, 2:-2], inner, np.load(out / "depth" / f"{stem}.npy")
-    stems = [*views]
-    for k, stem in enumerate(stems):
-        origins, directions, lengths = lens.rays(np.array(views[stem]))
-        points = origins + directions * (lengths * shown[stem][2].ravel())[:, None]
-        for name in (stems[k - 1], stems[k - len(stems) // 3]):
-            xy, z = lens.pixels(np.array(views[name]), points)
-            rows = np.flatnonzero(np.isfinite(xy[:, 0]) & shown[stem][1].ravel())
-            labels, inner, depth = (each[tuple(xy[rows, ::-1].astype(int).T)] for each in shown[name])
-            same = inner & (np.abs(depth - z[rows]) < 0.01 * z[rows])
-            total += int(same.sum())
-            right += int((labels == shown[stem][0].ravel()[rows])[same].sum())
-    return right / max(total, 1), total
 
 
 def main() -> None:
     """Make a room, or continue one."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scene", type=Path, metavar="SCENE", help="a folder of the collection, with scene.xml")
-    parser.add_argument(
-        "out", type=Path, metavar="OUT", help="the folder to make, or to continue with the same options"
-    )
+    parser.add_argument("out", type=Path, metavar="OUT", help="the folder to make, or to continue")
     parser.add_argument("--train", type=int, default=60, help="training views (60)")
     parser.add_argument("--test", type=int, default=30, help="test views (30)")
     parser.add_argument("--size", default="640x480", help="WIDTHxHEIGHT of the pictures (640x480)")
     parser.add_argument("--spp", type=int, default=16, help="samples a pixel, before denoising (16)")
     parser.add_argument("--seed", type=int, default=0, help="decides the path, the test views and the noise (0)")
     parser.add_argument(
-        "--without", nargs="*", help="things to remove in without/ (what the JSON names); none: no such views"
+        "--without", nargs="*", help="things to remove in without/ (those of the JSON); none: no such views"
     )
     args = parser.parse_args()
     table = Path(__file__).with_suffix("") / f"{args.scene.resolve().name}.json"
@@ -302,41 +245,32 @@ def main() -> None:
     width, height = map(int, args.size.split("x"))
     lens = Lens(width, height, 0.65 * width)  # 75 degrees from side to side
     without = about["without"] if args.without is None else args.without
-    options = {"scene": table.stem, "train": args.train, "test": args.test, "size": [width, height], "spp": args.spp}
-    options |= {"seed": args.seed, "without": without}
-    room = Room(args.scene, about)
-    things, file = Things(about, room.shapes), args.out / "plan.json"
+    options = vars(args) | {"scene": table.stem, "out": None, "without": without}
+    room = Room(args.scene, about["metres_per_unit"])
+    things, file = Things(about["things"], room.shapes), args.out / "plan.json"
     removed = things.named(without)
     if not file.exists():
         if args.out.exists() and any(args.out.iterdir()):
             raise SystemExit(f"{args.out}: expected a new or empty folder, or one that this program began")
-        inside = room.unit * room.to_scene.T @ np.array(about["inside"])
-        write(file, make_plan(room.distances, lens, inside, options))
+        views = plan_views(room.distances, lens, np.array(about["inside"]), args.train, args.test, args.seed)
         write(args.out / "CREDIT.txt", about["credit"])
+        write(file, {"options": options, "views": {stem: pose.tolist() for stem, pose in views.items()}})
     plan = json.loads(file.read_text(encoding="utf-8"))
     if plan["options"] != options:
         raise SystemExit(f"{args.out}: made with {plan['options']}, not {options}; choose another folder")
-    jobs = [(room, things, args.out, stem) for stem in plan["views"]]
+    views = {stem: np.array(pose) for stem, pose in plan["views"].items()}
+    jobs = [(room, things, args.out, stem) for stem in views]
     if removed:
-        less = Room(args.scene, about, removed)
-        rest = {
-            kind: [[m for m in meshes if m not in removed] for meshes in all_] for kind, all_ in about["things"].items()
-        }
-        jobs += [
-            (less, Things(about | {"things": rest}, less.shapes), args.out / "without", s)
-            for s in plan["views"]
-            if "test" in s
-        ]
+        less = Room(args.scene, about["metres_per_unit"], removed)
+        kept = Things(about["things"], less.shapes, removed)
+        jobs += [(less, kept, args.out / "without", stem) for stem in views if stem.startswith("test")]
     for number, (shown, ids, out, stem) in enumerate(jobs):
         if not (out / "images" / f"{stem}.png").exists():
             started, light = time.time(), {"spp": args.spp, "seed": number, "exposure": about["exposure"]}
-            render_view(shown, ids, lens, np.array(plan["views"][stem]), out, stem, **light)
+            render_view(shown, ids, lens, views[stem], out, stem, **light)
             print(f"{number + 1} of {len(jobs)}: {out.name}/{stem}, {time.time() - started:.1f} s", flush=True)
-    write_scene(args.out, lens, plan, things)
-    share, count = agreement(args.out, lens, plan["views"])
-    print(
-        f"{args.out}: {len(plan['views'])} views; of {count:,} places in two views away from borders, {share:.2%} have one class"
-    )
+    write_scene(args.out, lens, views, things, args.seed)
+    print(f"{args.out}: {args.train} training and {args.test} test views")
 
 
 if __name__ == "__main__":

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import islice
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,15 +60,10 @@ def look(eye: Array, direction: Array) -> Array:  # [4, 4]
     return pose
 
 
-def around(count: int) -> Array:  # [count, 3]
-    """Directions that cover the sphere evenly (Fibonacci lattice)."""
-    z, turn = 1 - (2 * np.arange(count) + 1) / count, np.arange(count) * np.pi * (3 - 5**0.5)
-    return np.stack([*(np.sqrt(1 - z**2) * [np.cos(turn), np.sin(turn)]), z], -1)
-
-
 def is_free(distances: Distances, places: Array, rays: int = 300) -> NDArray[np.bool_]:  # [P]
-    """Whether places are in the room and farther than `CLEARANCE` from every surface."""
-    directions = around(rays)
+    """Whether places are in the room and farther than `CLEARANCE` from every surface, along rays of a Fibonacci lattice."""
+    z, turn = 1 - (2 * np.arange(rays) + 1) / rays, np.arange(rays) * np.pi * (3 - 5**0.5)
+    directions = np.stack([*(np.sqrt(1 - z**2) * [np.cos(turn), np.sin(turn)]), z], -1)
     hits = distances(np.repeat(places, rays, 0), np.tile(directions, (len(places), 1))).reshape(-1, rays)
     return (hits.min(-1) > CLEARANCE) & (np.isinf(hits).mean(-1) < OUTDOORS)
 
@@ -117,21 +113,15 @@ def training_path(distances: Distances, lens: Lens, free: Array, count: int, rng
             if not len(tight := np.flatnonzero(~is_free(distances, ring))):
                 break
             ring[tight, :2] += 0.1 * (centre[:2] - ring[tight, :2])
-        free_ring = is_free(distances, ring)
         lengths = np.linalg.norm(np.diff(ring, axis=0, append=ring[:1]), axis=-1).cumsum()
         for i in np.searchsorted(lengths, (np.arange(many) + 0.5) / many * lengths[-1]):
             yaw = angles[i] + np.pi + np.radians(swing) * np.sin(3 * angles[i] + phase[1])
-            pitch = np.radians(-10) + np.radians(14) * np.sin(5 * angles[i] + phase[2])
-            for turn in np.radians([0, 20, -20, 40, -40, 70, -70, 100, -100, 140, -140, 180]):
-                heading = (np.cos(yaw + turn), np.sin(yaw + turn), np.tan(pitch))
-                pose = look(ring[i], np.array(heading))
-                if free_ring[i] and sees(distances, lens, pose):
-                    poses.append(pose)
-                    break
-    if len(poses) < count:
-        raise ValueError(
-            f"train: expected {count} places with free sight on two rounds, got {len(poses)}; free more room"
-        )
+            slope = np.tan(np.radians(-10 + 14 * np.sin(5 * angles[i] + phase[2])))
+            yaws = yaw + np.radians([0, 20, -20, 40, -40, 70, -70, 100, -100, 140, -140, 180])
+            tries = (look(ring[i], np.array([np.cos(a), np.sin(a), slope])) for a in yaws)
+            poses += islice((pose for pose in tries if sees(distances, lens, pose)), 1)
+    if len(poses) < count or not is_free(distances, np.stack([pose[:3, 3] for pose in poses])).all():
+        raise ValueError(f"train: expected {count} free places with free sight on two rounds, got {len(poses)}")
     return poses
 
 
@@ -152,8 +142,6 @@ def test_views(
     """Cameras at random free places that are not on the training path, looking at what training cameras saw."""
     eyes, views = np.stack([pose[:3, 3] for pose in train]), list[Array]()
     for _ in range(60 * count):
-        if len(views) == count:
-            return views
         eye = free[rng.integers(len(free))] + rng.uniform(-STEP / 2, STEP / 2, 3)
         near = np.linalg.norm(np.concatenate([eyes, *(view[None, :3, 3] for view in views)]) - eye, axis=-1)
         if near.min() <= APART or not is_free(distances, eye[None])[0]:
@@ -170,6 +158,14 @@ def test_views(
         points = (origins + directions * hits[:, None])[np.isfinite(hits)]
         if sees(distances, lens, pose) and (views_of(distances, lens, train, points) >= KNOWN_VIEWS).mean() >= KNOWN:
             views.append(pose)
-    raise ValueError(
-        f"test: expected {count} views of what training views saw, got {len(views)}; take more training views"
-    )
+        if len(views) == count:
+            return views
+    raise ValueError(f"test: expected {count} views of what training views saw, got {len(views)}; train more views")
+
+
+def plan_views(distances: Distances, lens: Lens, inside: Array, train: int, test: int, seed: int) -> dict[str, Array]:
+    """The poses of all views by name, train_000 to test_029; `inside` is a place in the room."""
+    rng, free = np.random.default_rng(seed), free_places(distances, inside)
+    poses = {"train": training_path(distances, lens, free, train, rng)}
+    poses["test"] = test_views(distances, lens, free, poses["train"], test, rng)
+    return {f"{split}_{i:03d}": pose for split, views in poses.items() for i, pose in enumerate(views)}
