@@ -25,7 +25,7 @@ def _log(note: str) -> None:
     logging.getLogger("kfgs").log(logging.INFO if isinstance(note, Wait) else logging.WARNING, note)
 
 
-_listeners: list[tuple[Callable[[str], None], bool]] = [(_log, False)]  # the last is told; whether readers are strict
+_listeners: list[tuple[Callable[[str], None], bool]] = [(_log, False)]  # the last is told; are readers strict?
 
 
 @contextmanager

@@ -1,7 +1,7 @@
 """Coordinates far from zero (UTM, ECEF, site grids): in memory they are float32, counted from an origin in float64.
 
-Readers parse in float64, and keep what `recounted` from `choose_origin` is in float32. Answers and files for people pass through
-`to_world`.
+Readers parse in float64, call `choose_origin`, and keep the `recounted` places in float32. Answers and files for people pass
+through `to_world`.
 """
 
 from __future__ import annotations

@@ -121,7 +121,7 @@ class Codebook(Stored):
 
 
 def as_channels(name: str, values: Tensor, channels: int, *, floating: bool = False) -> Tensor:  # [..., channels]
-    """Features or latents as a tensor; a ValueError if their last axis does not fit what was fitted to others."""
+    """Features or latents as a tensor; a ValueError if they have another number of channels than those of the fit."""
     values = as_tensor(name, values, floating=floating)
     if values.shape[-1:] != (channels,):
         got = f"{tuple(values.shape)}; pass those of the teacher and the scene that it was fitted to"

@@ -169,7 +169,7 @@ def grow(
     features, so rare content gets codewords as readily as a wall; by at least 2 `LEAST_SHARE` n / `maximum` features,
     so that a few outliers never lead; and by a split that lowers its cosine distance by `LEAST_GAIN`, which noise
     without structure does not allow. At most half of the cells split in one round.
-    Of each round the size after it, the codewords added, and the features' similarities [n] before are returned.
+    Returned for each round: the size after it, the codewords added, and the features' similarities [n] before.
     """
     least = max(2.0, LEAST_SHARE * len(unit) / maximum)
     centres, nearest = refine(unit, unit_rows(unit.sum(dim=0, keepdim=True)), 0)
