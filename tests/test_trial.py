@@ -44,8 +44,10 @@ def plotter():
 def test_1_cameras_and_photos_of_a_scene(scene):
     for i, camera in enumerate(scene.cameras):
         assert scene.image(i).shape == (*camera.size, 3)
-        assert camera.viewmat.shape == (4, 4)
-        assert camera.center.shape == (3,)
+        assert camera.R.shape == (3, 3)
+        assert torch.allclose(camera.R @ camera.center + camera.t, torch.zeros(3), atol=1e-5)
+        assert torch.allclose(camera.c2w[:3, 3], camera.center, atol=1e-5)
+        assert min(camera.fx, camera.fy, camera.cx, camera.cy) > 0
 
 
 def test_2_a_picture_of_features_from_a_new_view(field):
@@ -98,7 +100,7 @@ def test_8_several_splats(field, splat, tmp_path):
 def test_9_a_label_map_with_a_legend(scene, field):
     labels = field.segment(scene.cameras[0])
     pictures = [
-        viz.overlay_labels(scene.image(0), labels, n) for n in (field.classes.names, field.classes, field.label())
+        viz.overlay_labels(scene.image(0), labels, n) for n in (field.names, field.classes, field, field.label())
     ]
     assert all((picture == pictures[0]).all() for picture in pictures)
 
@@ -140,7 +142,8 @@ def test_14_crops(field, splat):
     low, high = field.gaussians.means.amin(0).tolist(), field.gaussians.means.mean(0).tolist()
     inside = InBox(low, high).select(field)
     assert 0 < len(inside) < len(field)
-    assert len(field.select(inside)) == len(field.gaussians[inside]) == len(inside)
+    for which in (inside, inside.mask, inside.indices):
+        assert len(field[which]) == len(field.select(which)) == len(field.gaussians[which]) == len(inside)
     assert len(splat[labelled.labels >= 0]) <= len(splat)
     for which in ("chair", OfClass("chair"), InBox(low, high)):
         refused(lambda which=which: splat[which], "which:", "OfClass('chair').select(cloud)", error=TypeError)

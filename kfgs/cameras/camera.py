@@ -61,6 +61,13 @@ class Camera:
     distortion: Distortion | None = None
     near: float = NEAR  # > 0, world units: the smallest depth that is drawn
     origin: tuple[float, float, float] = ORIGIN  # where the (0, 0, 0) that viewmat maps from lies in the world
+    R = property(lambda self: self.viewmat[:3, :3], doc="The rotation from world to camera [3, 3].")
+    t = property(lambda self: self.viewmat[:3, 3], doc="The translation from world to camera [3]: x_camera = R x + t.")
+    c2w = property(lambda self: torch.linalg.inv(self.viewmat), doc="Camera to world [4, 4], the inverse of `viewmat`.")
+    fx = property(lambda self: float(self.K[0, 0]), doc="The horizontal focal length, pixels.")
+    fy = property(lambda self: float(self.K[1, 1]), doc="The vertical focal length, pixels.")
+    cx = property(lambda self: float(self.K[0, 2]), doc="The principal point, pixels from the left edge.")
+    cy = property(lambda self: float(self.K[1, 2]), doc="The principal point, pixels from the upper edge.")
 
     def __post_init__(self) -> None:
         for name in ("viewmat", "K"):  # integers would truncate the points
@@ -114,10 +121,9 @@ class Camera:
         forward, zenith = unit_vector("target - eye", aim - place), unit_vector("up", up)
         right = torch.linalg.cross(forward, zenith)
         if float(right.norm()) < 1e-6:
-            raise ValueError(
-                f"up: expected another direction than that of the view, got {zenith.tolist()} for a view along "
-                f"{forward.tolist()}; pass a direction that is up in the picture, for instance (0, 1, 0)"
-            )
+            got = f"{zenith.tolist()} for a view along {forward.tolist()}"
+            advice = "pass a direction that is up in the picture, for instance (0, 1, 0)"
+            raise ValueError(f"up: expected another direction than that of the view, got {got}; {advice}")
         right = right / right.norm()
         R = torch.stack([right, torch.linalg.cross(forward, right), forward])  # x right, y down, z forward
         viewmat = torch.eye(4, dtype=torch.float64)
@@ -128,7 +134,7 @@ class Camera:
 
     def __repr__(self) -> str:
         center = to_world(self.center, self.origin)
-        fov = 2 * math.degrees(math.atan(self.height / 2 / float(self.K[1, 1])))
+        fov = 2 * math.degrees(math.atan(self.height / 2 / self.fy))
         lens = "" if self.distortion is None else f", {self.distortion.model}"
         place = ", ".join(f"{value:.{4 if self.origin == ORIGIN else 10}g}" for value in center.tolist())
         return f"Camera({cut(self.name, 80)!r}, {self.width}x{self.height}, fov {fov:.1f}, at ({place}){lens})"

@@ -29,8 +29,7 @@ def world_to_camera(camera: Camera, points: Tensor) -> Tensor:  # points: [N, 3]
     twice as long.
     """
     check_shapes(("points", points := as_tensor("points", points, floating=True), "N 3"))
-    viewmat = camera.viewmat.to(points)
-    return points @ viewmat[:3, :3].T + viewmat[:3, 3]
+    return points @ camera.R.to(points).T + camera.t.to(points)
 
 
 def camera_to_pixel(camera: Camera, points_cam: Tensor) -> Tensor:  # points_cam: [N, 3] -> [N, 2]
@@ -140,17 +139,15 @@ def unproject_depth(camera: Camera, depth: Tensor) -> Tensor:  # depth: [H, W] -
     check_shapes(("depth", depth := as_tensor("depth", depth, floating=True), (camera.height, camera.width)))
     refuse_distortion(camera)
     K = camera.intrinsics_at_integer_centers.to(depth)  # kornia's pixel grid counts from 0, not from 0.5
-    viewmat = camera.viewmat.to(depth)
-    return (depth_to_3d_v2(depth, K[None])[0] - viewmat[:3, 3]) @ viewmat[:3, :3]  # R^T (X - t)
+    return (depth_to_3d_v2(depth, K[None])[0] - camera.t.to(depth)) @ camera.R.to(depth)  # R^T (X - t)
 
 
 def refuse_distortion(camera: Camera) -> None:
     """Raise a ValueError if a camera has a lens."""
     if camera.distortion is not None:
-        raise ValueError(
-            f"camera: expected a pinhole camera, got {camera.distortion.model} distortion (camera {camera.name!r}); "
-            "undistort its images first (kfgs.cameras.undistort) and use the camera that returns"
-        )
+        got = f"{camera.distortion.model} distortion (camera {camera.name!r})"
+        advice = "undistort its images first (kfgs.cameras.undistort) and use the camera that returns"
+        raise ValueError(f"camera: expected a pinhole camera, got {got}; {advice}")
 
 
 def to_kornia(cameras: Sequence[Camera]) -> PinholeCamera:

@@ -94,11 +94,9 @@ class Similarity:
         Its viewmat stays a rigid motion, [R_c R^T, s t_c - R_c R^T t], so depths and `near` become `scale` times as large; K,
         the size and the lens stay. The camera's `origin` moves with it.
         """
-        view = camera.viewmat.detach().double().cpu()
-        moved = torch.eye(4, dtype=torch.float64)
         local, origin = self.between_origins(camera.origin)
-        moved[:3, :3] = view[:3, :3] @ self.rotation.T
-        moved[:3, 3] = self.scale * view[:3, 3] - moved[:3, :3] @ local.translation
+        moved = camera.viewmat.detach().double().cpu() @ local.inverse().matrix()
+        moved[:3] *= self.scale
         return replace(camera, viewmat=moved.to(camera.viewmat), near=self.scale * camera.near, origin=origin)
 
     def between_origins(self, origin: Origin) -> tuple[Similarity, Origin]:

@@ -34,7 +34,7 @@ _VOTES: WeakKeyDictionary[Any, tuple[Any, Tensor, Votes]] = WeakKeyDictionary()
 class SemanticField:
     """The result of a fit: find things (`query`), give each Gaussian a class (`classify`) or each pixel (`segment`).
 
-    `field.gaussians[field.query("chair")]` are the Gaussians of the chair.
+    `field.gaussians[field.query("chair")]` are the Gaussians of the chair, `field[...]` is the field of them.
 
     **The rule.** The class or score of a Gaussian is that of its *fused* feature: the mean over the pixels of the training
     views that show it. A field made by `uplift_maps` has these as its latents. A trained field holds them as a second field of
@@ -55,6 +55,7 @@ class SemanticField:
     """The origin of the field, as JSON."""
     fused: SemanticField | None = None
     """The fused features of a trained field (`fuse_views`), with a `Linear` decoder."""
+    names = property(lambda self: () if self.classes is None else self.classes.names, doc="The names of its classes.")
 
     def __post_init__(self) -> None:
         if self.gaussians.features is None:
@@ -127,6 +128,8 @@ class SemanticField:
         rows = as_rows("which", which, len(self))
         fused = None if self.fused is None else self.fused.select(rows)
         return replace(self, gaussians=self.gaussians.select(rows), fused=fused)
+
+    __getitem__ = select
 
     # Maps
 

@@ -165,3 +165,13 @@ def test_an_unknown_name_does_not_mean_the_view_without_a_name():
     nameless = Camera(torch.eye(4), K, 96, 64)
     with pytest.raises(ValueError, match=tells("examples:", "training view", "got 'b'")):
         view_named([nameless], "b", "examples")
+
+
+def test_a_camera_has_what_others_call_its_parts():
+    camera = Camera.look_at((1.0, 2.0, 3.0), (0.0, 0.5, 0.0), width=96, height=64)
+    point = torch.tensor([0.3, -0.2, 0.1])
+    seen = camera.R @ point + camera.t
+    torch.testing.assert_close(camera.c2w @ torch.cat([seen, torch.ones(1)]), torch.cat([point, torch.ones(1)]))
+    torch.testing.assert_close(camera.c2w[:3, 3], camera.center)
+    pixel = torch.tensor([camera.fx * seen[0] / seen[2] + camera.cx, camera.fy * seen[1] / seen[2] + camera.cy])
+    torch.testing.assert_close(project_points(camera, point[None])[0][0], pixel)
