@@ -16,8 +16,7 @@ from kfgs.scenes import FeatureFolder, extract_features, load_scene
 from kfgs.toy.room_folder import make_toy_room
 
 COLOR = dataclasses.replace(
-    ColorConfig.quick(),
-    training=changed(ColorConfig.quick().training.with_steps(24), maximum=800, checkpoint_every=8),
+    ColorConfig.quick(), training=changed(ColorConfig.quick().training.with_steps(24), maximum=800, checkpoint_every=8)
 )
 METHOD = Uplift(color=COLOR)
 OPTIONS = BatchOptions(teacher="tiny_teacher:Tiny", method=METHOD, pictures=0)

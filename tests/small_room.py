@@ -22,14 +22,7 @@ ROOM = ToyConfig(
     sparse_points=1_500,
 )
 FIELD = changed(
-    Training.cpu(),
-    steps=120,
-    features_rate=0.05,
-    start=20,
-    stop=80,
-    every=20,
-    reset_every=0,
-    checkpoint_every=7,
+    Training.cpu(), steps=120, features_rate=0.05, start=20, stop=80, every=20, reset_every=0, checkpoint_every=7
 )
 PAPER = Paper.paper(
     codebook=PaperCodebook(initial=4, maximum=24, epochs=4, step_every=1, learning_rate=0.02),

@@ -143,10 +143,7 @@ def test_version_and_overview(capsys):
 
 
 @pytest.mark.parametrize(
-    ("line", "choices"),
-    [
-        ("fit scene --out run --method fast", ["uplift", "paper", "paper-full", "adc", "decouple"]),
-    ],
+    ("line", "choices"), [("fit scene --out run --method fast", ["uplift", "paper", "paper-full", "adc", "decouple"])]
 )
 def test_a_wrong_choice_is_told_the_words_that_can_be_given(line, choices, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "200")

@@ -9,7 +9,7 @@ import pytest
 import torch
 from cases_color import surface
 from cases_text import DIM, TEACHER, letters, save_letters
-from messages import tells
+from messages import refused, tells
 from PIL import Image
 
 from kfgs.cli import features, main
@@ -51,8 +51,7 @@ def test_words_are_words_whatever_lies_in_the_folder(tmp_path, monkeypatch):
     assert read_words("chair") == ["chair"]
     many = [f"class number {i}" for i in range(400)]  # longer than any file name, and than any path
     assert read_words(",".join(many)) == many
-    with pytest.raises(FileNotFoundError, match=tells("no such file", "text")):
-        read_words("a" * 300 + ".txt")
+    refused(lambda: read_words("a" * 300 + ".txt"), "no such file", "text", error=FileNotFoundError)
 
 
 def test_text_writes_a_table_with_its_origin(tmp_path, capsys):
@@ -149,18 +148,12 @@ def test_words_of_another_teacher_are_noted(field, names, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (
-            ["lampp", "--text", "{table}"],
-            ("class:", "got 'lampp'", "'lamp'?", "--teacher", "--weights"),
-        ),
+        (["lampp", "--text", "{table}"], ("class:", "got 'lampp'", "'lamp'?", "--teacher", "--weights")),
         (["lamp", "--text", "{table}", "--weights", "a.pt"], ("--weights:", "--teacher", "got a.pt")),
         (["lamp", "--teacher", "cases_text:MUTE"], ("teacher 'mute':", "text encoder")),
         (["lamp"], ("--text:", "got none", "`kfgs features FIELD --examples clicks.json")),
         (["palm", "--text", "{other}", *LETTERS], ("--text:", "[C, 16]", "teacher")),
-        (
-            ["lamp", "--text", "{other}"],
-            ("--text:", "[C, 16]", "got ({count}, 5)"),
-        ),
+        (["lamp", "--text", "{other}"], ("--text:", "[C, 16]", "got ({count}, 5)")),
         (["lamp", "--text", "{shown}"], ("--text:", "[C, 16]", "another teacher", "`kfgs features FIELD --examples")),
         (["lamp", "--text", "{tmp}/no.safetensors"], ("no.safetensors:", "no such file")),
     ],

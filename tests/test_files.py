@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 from killed import kill_everywhere
-from messages import tells
+from messages import refused, tells
 
 import kfgs
 from kfgs._files import (
@@ -230,10 +230,8 @@ def test_json_refuses_what_json_cannot_hold(tmp_path):
 @pytest.mark.parametrize("content", [b'{"a": 1', b"\xff\xfe{}", b"\xff{}", b"", b"1" * 5000, b"[" * 100_000])
 def test_broken_json_names_the_file(tmp_path, content):
     (tmp_path / "split.json").write_bytes(content)
-    with pytest.raises(ValueError, match=tells("split.json:", "JSON")):
-        read_json(tmp_path / "split.json")
-    with pytest.raises(FileNotFoundError, match=tells("none.json:", "no such file", "JSON")):
-        read_json(tmp_path / "none.json")
+    refused(lambda: read_json(tmp_path / "split.json"), "split.json:", "JSON")
+    refused(lambda: read_json(tmp_path / "none.json"), "none.json:", "no such file", "JSON", error=FileNotFoundError)
 
 
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])

@@ -4,7 +4,6 @@ import sys
 import pytest
 
 RUN = "import sys; from kfgs.__main__ import run; sys.argv = ['kfgs', *sys.argv[1:]]; sys.exit(run())"
-BEFORE = "import atexit, os, signal; ctrl_c = lambda: os.kill(os.getpid(), signal.SIGINT)\n"
 
 
 def run(folder, *words, code=RUN):

@@ -18,8 +18,7 @@ def test_the_version_stands_in_one_place():
 
 
 @pytest.mark.parametrize(
-    ("file", "line"),
-    [("CITATION.cff", r"^version: (.+)$"), ("docs/compare.md", r"^  version = \{(.+)\},$")],
+    ("file", "line"), [("CITATION.cff", r"^version: (.+)$"), ("docs/compare.md", r"^  version = \{(.+)\},$")]
 )
 def test_files_that_repeat_the_version_have_the_same(file, line):
     assert re.findall(line, (ROOT / file).read_text(encoding="utf-8"), re.M) == [kfgs.__version__]

@@ -1,7 +1,7 @@
 """Lists of scenes: what may be written, and what each wrong line says."""
 
 import pytest
-from messages import tells
+from messages import refused, tells
 
 from kfgs.batch import read_scenes
 
@@ -37,8 +37,7 @@ def test_all_wrong_lines_are_named(listed):
 
 @pytest.mark.parametrize("text", ["", "# nothing\n\n"])
 def test_an_empty_list_is_refused(listed, text):
-    with pytest.raises(ValueError, match=tells("expected an existing scene", "no scene")):
-        read_scenes(listed(text))
+    refused(lambda: read_scenes(listed(text)), "expected an existing scene", "no scene")
 
 
 def test_lists_of_other_systems_are_read(listed, tmp_path):
@@ -46,9 +45,6 @@ def test_lists_of_other_systems_are_read(listed, tmp_path):
     path.write_bytes(b"\xef\xbb\xbfkitchen\r\n\r\n")
     assert read_scenes(path) == {"kitchen": str(tmp_path / "kitchen")}
     path.write_bytes("K\u00fcche\r\n".encode("latin-1"))
-    with pytest.raises(ValueError, match=tells("scenes.txt", "UTF-8")):
-        read_scenes(path)
-    with pytest.raises(FileNotFoundError, match=tells("no such file", "a folder per line")):
-        read_scenes(tmp_path / "none.txt")
-    with pytest.raises(ValueError, match=tells("expected a text file", "got a folder")):
-        read_scenes(tmp_path)
+    refused(lambda: read_scenes(path), "scenes.txt", "UTF-8")
+    refused(lambda: read_scenes(tmp_path / "none.txt"), "no such file", "a folder per line", error=FileNotFoundError)
+    refused(lambda: read_scenes(tmp_path), "expected a text file", "got a folder")

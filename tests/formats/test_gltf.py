@@ -7,7 +7,7 @@ import pygltflib
 import pytest
 import torch
 from cases_gltf import KHR, bent_gltf, random_cloud
-from messages import tells
+from messages import refused, tells
 from scipy.spatial.transform import Rotation
 
 from kfgs.formats import read_splats, write_splats
@@ -108,10 +108,8 @@ def test_primitives_join(tmp_path):
 
 
 def test_what_cannot_be_written_is_named(tmp_path):
-    with pytest.raises(ValueError, match=tells("gaussians:", "colours", ".glb")):
-        write_splats(random_cloud().replace(sh=None), tmp_path / "a.glb")
-    with pytest.raises(ValueError, match=tells("gaussians:", "got none", ".ply")):
-        write_splats(random_cloud(0), tmp_path / "a.glb")
+    refused(lambda: write_splats(random_cloud().replace(sh=None), tmp_path / "a.glb"), "gaussians:", "colours", ".glb")
+    refused(lambda: write_splats(random_cloud(0), tmp_path / "a.glb"), "gaussians:", "got none", ".ply")
     with pytest.raises(ValueError, match=tells("labels:", "expected -1 to 16777216", "glTF", "got 99999999")):
         write_splats(random_cloud(2).replace(labels=torch.tensor([0, 99_999_999])), tmp_path / "a.glb")
     assert list(tmp_path.iterdir()) == []

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from cases_gltf import KHR, bent_gltf, json_of_glb, random_cloud
-from messages import tells
+from messages import refused
 
 from kfgs.formats import read_splats, write_splats
 
@@ -25,11 +25,9 @@ def test_a_buffer_beside_the_document_is_read(tmp_path):
     path.write_text(json.dumps(root))
     assert torch.equal(read_splats(path).means, cloud.means)
     (tmp_path / "my data.bin").write_bytes(blob[:-9])
-    with pytest.raises(ValueError, match=tells("bent.gltf:", "buffers[0]", "bytes")):
-        read_splats(path)
+    refused(lambda: read_splats(path), "bent.gltf:", "buffers[0]", "bytes")
     (tmp_path / "my data.bin").unlink()
-    with pytest.raises(ValueError, match=tells("bent.gltf:", "my%20data.bin")):
-        read_splats(path)
+    refused(lambda: read_splats(path), "bent.gltf:", "my%20data.bin")
 
 
 @pytest.mark.parametrize("form", ["NFC", "NFD"])
@@ -56,8 +54,7 @@ def test_uris_that_lead_elsewhere_are_refused(tmp_path, uri):
     (tmp_path / "secret.bin").write_bytes(b"\0" * 4096)
     (tmp_path / "scene").mkdir()
     path = bent_gltf(tmp_path / "scene", **{"buffers/0/uri": uri})
-    with pytest.raises(ValueError, match=tells("bent.gltf:", "uri")):
-        read_splats(path)
+    refused(lambda: read_splats(path), "bent.gltf:", "uri")
 
 
 def test_links_that_lead_elsewhere_are_refused(tmp_path):
@@ -65,8 +62,7 @@ def test_links_that_lead_elsewhere_are_refused(tmp_path):
     (tmp_path / "scene").mkdir()
     (tmp_path / "scene" / "a.bin").symlink_to(tmp_path / "secret.bin")
     path = bent_gltf(tmp_path / "scene", **{"buffers/0/uri": "a.bin"})
-    with pytest.raises(ValueError, match=tells("bent.gltf:", "a.bin")):
-        read_splats(path)
+    refused(lambda: read_splats(path), "bent.gltf:", "a.bin")
 
 
 A = "meshes/0/primitives/0/attributes"
@@ -115,16 +111,14 @@ def test_one_buffer_shown_a_thousand_times_is_refused(tmp_path):
     root = json.loads(path.read_text())
     root["meshes"][0]["primitives"] *= 1000
     path.write_text(json.dumps(root))
-    with pytest.raises(ValueError, match=tells("bent.gltf:", "56800 Gaussians", "buffer")):
-        read_splats(path)
+    refused(lambda: read_splats(path), "bent.gltf:", "56800 Gaussians", "buffer")
 
 
 def test_json_of_millions_of_values_is_not_parsed(tmp_path):
     text = b'{"asset": {"version": "2.0"}, "accessors": [' + b"[]," * (1 << 20) + b"0]}"
     (tmp_path / "a.gltf").write_bytes(text)
     tracemalloc.start()
-    with pytest.raises(ValueError, match=tells("a.gltf:", "1048576", "20971")):
-        read_splats(tmp_path / "a.gltf")
+    refused(lambda: read_splats(tmp_path / "a.gltf"), "a.gltf:", "1048576", "20971")
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 4 * len(text)

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 from cases_ksplat import BLOCK, C0, CENTRES, QUANTUM, ROWS, SH, ksplat_file, ksplat_section
-from messages import tells
+from messages import refused
 
 from kfgs.formats import read_splats, write_splats
 from kfgs.formats.ksplat import read
@@ -52,8 +52,7 @@ def test_the_fixture_is_the_scene_of_the_splat_file(shared_data):
 
 def test_it_is_only_read(tmp_path, shared_data):
     splats = read_splats(shared_data / "splats" / "minimal.ksplat")
-    with pytest.raises(ValueError, match=tells("path:", "got 'a.ksplat'")):
-        write_splats(splats, tmp_path / "a.ksplat")
+    refused(lambda: write_splats(splats, tmp_path / "a.ksplat"), "path:", "got 'a.ksplat'")
 
 
 _S = ksplat_section(1, [0, 1], 1, 1, [1])

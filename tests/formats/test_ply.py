@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 from cases_gltf import random_cloud
-from messages import tells
+from messages import refused, tells
 
 from kfgs import Gaussians
 from kfgs.formats import read_splats, write_splats
@@ -99,18 +99,14 @@ LITTLE = b"ply\nformat binary_little_endian 1.0\n"
 )
 def test_bad_files_are_named(tmp_path, content, why):
     (tmp_path / "bad.ply").write_bytes(content)
-    with pytest.raises(ValueError, match=tells("bad.ply:", why, "write it again")):
-        read_ply(tmp_path / "bad.ply")
+    refused(lambda: read_ply(tmp_path / "bad.ply"), "bad.ply:", why, "write it again")
 
 
 def test_missing_file_and_columns(tmp_path):
-    with pytest.raises(FileNotFoundError, match=tells("none.ply:", "no such file")):
-        read_ply(tmp_path / "none.ply")
-    with pytest.raises(ValueError, match=tells("b.ply: ", "y, z", "got x")):
-        points_from_columns("b.ply", {"x": np.zeros(1)})
+    refused(lambda: read_ply(tmp_path / "none.ply"), "none.ply:", "no such file", error=FileNotFoundError)
+    refused(lambda: points_from_columns("b.ply", {"x": np.zeros(1)}), "b.ply: ", "y, z", "got x")
     write_ply(tmp_path / "points.ply", {name: np.zeros(1) for name in "xyz"})
-    with pytest.raises(ValueError, match=tells("points.ply:", "opacity, scale_0", "point cloud")):
-        read_splats(tmp_path / "points.ply")
+    refused(lambda: read_splats(tmp_path / "points.ply"), "points.ply:", "opacity, scale_0", "point cloud")
     (tmp_path / "points.ply").unlink()
     with pytest.raises(ValueError, match=tells("columns:", "length", "{'x': 1, 'y': 2}")):
         write_ply(tmp_path / "a.ply", {"x": np.zeros(1), "y": np.zeros(2)})
@@ -133,8 +129,7 @@ def test_missing_file_and_columns(tmp_path):
 def test_odd_columns_are_named(tmp_path, without, message):
     columns = columns_from_gaussians(_cloud())
     write_ply(tmp_path / "a.ply", {name: values for name, values in columns.items() if name not in without})
-    with pytest.raises(ValueError, match=tells("a.ply:", *message)):
-        read_splats(tmp_path / "a.ply")
+    refused(lambda: read_splats(tmp_path / "a.ply"), "a.ply:", *message)
 
 
 @pytest.mark.parametrize("layout", ["ascii", "binary_little_endian"])
@@ -169,11 +164,9 @@ def test_several_elements_survive_the_file(tmp_path):
     write_ply_elements(tmp_path / "a.ply", TABLES, comments=("first", "and second"))
     _assert_same(read_ply_elements(tmp_path / "a.ply"), TABLES)
     assert read_header(tmp_path / "a.ply").comments == ["first", "and second"]
-    with pytest.raises(ValueError, match=tells("a.ply:", "'vertex'", "['chunk'")):
-        read_ply(tmp_path / "a.ply")
+    refused(lambda: read_ply(tmp_path / "a.ply"), "a.ply:", "'vertex'", "['chunk'")
     (tmp_path / "short.ply").write_bytes((tmp_path / "a.ply").read_bytes()[:-1])
-    with pytest.raises(ValueError, match=tells("short.ply:", "'sh'", "truncated")):
-        read_ply_elements(tmp_path / "short.ply")
+    refused(lambda: read_ply_elements(tmp_path / "short.ply"), "short.ply:", "'sh'", "truncated")
 
 
 @pytest.mark.parametrize("label", [0.5, 1e300])
@@ -184,8 +177,7 @@ def test_labels_that_are_no_whole_numbers_are_named(tmp_path, label):
     write_ply(path, columns | {"class_id": np.full(count, 2.0)})
     assert read_splats(path).labels.tolist() == [2] * count
     write_ply(path, columns | {"class_id": np.array([0.0] * (count - 1) + [label])})
-    with pytest.raises(ValueError, match=tells("a.ply:", "class_id:", "whole number", f"at Gaussian {count - 1}")):
-        read_splats(path)
+    refused(lambda: read_splats(path), "a.ply:", "class_id:", "whole number", f"at Gaussian {count - 1}")
 
 
 def test_scales_far_below_the_smallest_that_is_needed_come_back(tmp_path):
@@ -230,8 +222,7 @@ def test_a_full_file_at_the_place_of_a_plain_one_leaves_nothing_beside_it(tmp_pa
 
 
 def test_plain_is_for_ply_files_with_colours(tmp_path):
-    with pytest.raises(ValueError, match=tells("plain:", "ends in .ply", "a.spz")):
-        write_splats(_cloud(), tmp_path / "a.spz", plain=True)
+    refused(lambda: write_splats(_cloud(), tmp_path / "a.spz", plain=True), "plain:", "ends in .ply", "a.spz")
     with pytest.raises(ValueError, match=tells("gaussians:", "colours", "a plain PLY")):
         write_splats(_cloud().replace(sh=None), tmp_path / "a.ply", plain=True)
     assert list(tmp_path.iterdir()) == []

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 from cases_gltf import random_cloud
-from messages import tells
+from messages import refused
 
 from kfgs import Gaussians
 from kfgs.formats import read_splats, write_splats
@@ -68,8 +68,7 @@ def test_scores_that_are_no_numbers_are_0_as_in_a_ply(path, notes):
 def test_labels_of_another_version_are_refused(path):
     content = path.read_bytes()
     path.write_bytes(content[32:] + content[:32])  # the same Gaussians in another order
-    with pytest.raises(ValueError, match=tells("labels.npz", "a.splat", "another")):
-        read_splats(path)
+    refused(lambda: read_splats(path), "labels.npz", "a.splat", "another")
 
 
 @pytest.mark.parametrize(
@@ -89,23 +88,20 @@ def test_labels_of_another_version_are_refused(path):
 )
 def test_damaged_labels_are_named(path, changes, message):
     _bend(path, **changes)
-    with pytest.raises(ValueError, match=tells("a.splat.labels.npz:", *message)):
-        read_splats(path)
+    refused(lambda: read_splats(path), "a.splat.labels.npz:", *message)
 
 
 @pytest.mark.parametrize("content", [b"", b"PK\x03\x04", b"hello" * 100, np.arange(6).tobytes()])
 def test_what_is_no_archive_is_named(path, content):
     beside(path, LABELS).write_bytes(content)
-    with pytest.raises(ValueError, match=tells("a.splat.labels.npz:", "read", "delete")):
-        read_splats(path)
+    refused(lambda: read_splats(path), "a.splat.labels.npz:", "read", "delete")
 
 
 def test_an_archive_that_unpacks_to_gigabytes_is_not_unpacked(path):
     with zipfile.ZipFile(beside(path, LABELS), "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("class_id.npy", b"\0" * (64 << 20))
     assert beside(path, LABELS).stat().st_size < 100_000
-    with pytest.raises(ValueError, match=tells("a.splat.labels.npz:", "67108864", "6 Gaussians")):
-        read_splats(path)
+    refused(lambda: read_splats(path), "a.splat.labels.npz:", "67108864", "6 Gaussians")
 
 
 def test_names_survive(tmp_path):
@@ -126,8 +122,7 @@ def test_names_survive(tmp_path):
 )
 def test_damaged_names_are_named(path, content, message):
     beside(path, NAMES).write_text(content)
-    with pytest.raises(ValueError, match=tells("a.splat.classes.json:", *message)):
-        read_splats(path)
+    refused(lambda: read_splats(path), "a.splat.classes.json:", *message)
 
 
 def test_names_of_files_that_share_a_stem_stay_apart(tmp_path):

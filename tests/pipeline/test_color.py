@@ -13,11 +13,7 @@ from kfgs.evaluation.color import score_views
 from kfgs.pipeline.color import ColorConfig, TrainingPictures, fit_color
 
 FIELD = changed(
-    ColorConfig.quick().training.with_steps(120),
-    every=10,
-    maximum=3_000,
-    report_every=20,
-    checkpoint_every=25,
+    ColorConfig.quick().training.with_steps(120), every=10, maximum=3_000, report_every=20, checkpoint_every=25
 )
 CONFIG = dataclasses.replace(ColorConfig.quick(), training=FIELD)
 

@@ -59,8 +59,7 @@ def test_principal_directions_of_a_known_moment():
 
 
 @pytest.mark.parametrize(
-    ("keep", "latents"),
-    [(0.1, 2), (0.49, 2), (0.51, 3), (0.79, 3), (0.81, 4), (0.99, 5), (1.0, 5)],
+    ("keep", "latents"), [(0.1, 2), (0.49, 2), (0.51, 3), (0.79, 3), (0.81, 4), (0.99, 5), (1.0, 5)]
 )
 def test_the_fewest_latents_that_keep_the_share_beyond_the_first(keep, latents):
     """Beyond the first direction lie 5 + 3 + 1.8 + 0.2 = 10: shares 0.5, 0.8, 0.98 and 1."""

@@ -213,11 +213,7 @@ def test_every_picture_has_its_own_size(tmp_path: Path) -> None:
     for i in range(3):
         write_picture(tmp_path / f"nerf/rgb/rgb_{i}.png")
     (tmp_path / "nerf/traj_w_c.txt").write_text("".join(_line(POSE) + "\n" for _ in range(3)))
-    last = (
-        "colmap/images/b.png",
-        "replica/room0/results/frame000002.jpg",
-        "scannet/color/2.jpg",
-    )
+    last = ("colmap/images/b.png", "replica/room0/results/frame000002.jpg", "scannet/color/2.jpg")
     for name in (*last, "nerf/rgb/rgb_2.png"):
         write_picture(tmp_path / name, 24, 32)
     for folder, fx in (("colmap", 50), ("replica/room0", 50), ("scannet", 50), ("nerf", 32)):

@@ -39,7 +39,6 @@ KINDS = ("ordinary", "needle", "huge", "tiny", "opaque", "faint", "outside")
 
 ENGINES = available_engines("cpu")
 COMPILED = "numba" if "numba" in ENGINES else "reference"  # where the test of the test is in float32
-every_engine = pytest.mark.parametrize("engine", ENGINES)
 
 
 # scenes ---------------------------------------------------------------------------------------------------------------

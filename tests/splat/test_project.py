@@ -6,7 +6,7 @@ import oracles_splat as oracle
 import pytest
 import torch
 from cases_splat import a_camera, gaussians_before
-from messages import tells
+from messages import refused, tells
 
 from kfgs.cameras.camera import Camera, Distortion
 from kfgs.gaussians import Gaussians
@@ -265,17 +265,14 @@ def test_camera_pose_has_a_gradient(project):
 
 def test_camera_with_distortion_is_refused(project):
     camera = replace(a_camera(), distortion=Distortion("brown_conrady", (0.1, 0.0, 0.0, 0.0)))
-    with pytest.raises(ValueError, match=tells("camera:", "got brown_conrady")):
-        project(_balls([[0.0, 0, 2]]), camera)
+    refused(lambda: project(_balls([[0.0, 0, 2]]), camera), "camera:", "got brown_conrady")
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
-    [({"near": 0.0}, ("near:", "got 0.0")), ({"low_pass": -0.1}, ("low_pass:", "got -0.1"))],
+    ("options", "message"), [({"near": 0.0}, ("near:", "got 0.0")), ({"low_pass": -0.1}, ("low_pass:", "got -0.1"))]
 )
 def test_options_out_of_range(project, options, message):
-    with pytest.raises(ValueError, match=tells(*message)):
-        project(_balls([[0.0, 0, 2]]), _straight(), **options)
+    refused(lambda: project(_balls([[0.0, 0, 2]]), _straight(), **options), *message)
 
 
 def test_compiled_engine_refuses_other_dtypes():

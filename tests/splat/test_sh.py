@@ -2,7 +2,7 @@ import numpy as np
 import oracles_splat as oracle
 import pytest
 import torch
-from messages import tells
+from messages import refused
 from scipy.spatial.transform import Rotation
 
 from kfgs.splat import evaluate_sh
@@ -64,13 +64,11 @@ def test_gradients():
 
 
 def test_number_of_coefficients_must_be_a_full_degree():
-    with pytest.raises(ValueError, match=tells("sh:", "expected 1, 4, 9 or 16", "got 5")):
-        evaluate_sh(torch.zeros(2, 5, 3), torch.ones(2, 3))
+    refused(lambda: evaluate_sh(torch.zeros(2, 5, 3), torch.ones(2, 3)), "sh:", "expected 1, 4, 9 or 16", "got 5")
 
 
 def test_one_direction_per_gaussian():
-    with pytest.raises(ValueError, match=tells("directions:", "[N, 3]", "N = 2", "got (1, 3)")):
-        evaluate_sh(torch.zeros(2, 4, 3), torch.ones(1, 3))
+    refused(lambda: evaluate_sh(torch.zeros(2, 4, 3), torch.ones(1, 3)), "directions:", "[N, 3]", "N = 2", "got (1, 3)")
 
 
 def _rotation(seed):
@@ -100,12 +98,9 @@ def test_turned_colours_keep_dtype_and_have_gradients():
 
 
 def test_what_cannot_turn_colours_is_named():
-    with pytest.raises(ValueError, match=tells("rotation:", "reflection")):
-        rotate_sh(_coefficients(4), torch.diag(torch.tensor([1.0, 1.0, -1.0])))
-    with pytest.raises(ValueError, match=tells("rotation:", "divide")):
-        rotate_sh(_coefficients(4), 2 * torch.eye(3))
-    with pytest.raises(ValueError, match=tells("sh:", "expected 1, 4, 9 or 16", "got 5")):
-        rotate_sh(torch.zeros(2, 5, 3), torch.eye(3))
+    refused(lambda: rotate_sh(_coefficients(4), torch.diag(torch.tensor([1.0, 1.0, -1.0]))), "rotation:", "reflection")
+    refused(lambda: rotate_sh(_coefficients(4), 2 * torch.eye(3)), "rotation:", "divide")
+    refused(lambda: rotate_sh(torch.zeros(2, 5, 3), torch.eye(3)), "sh:", "expected 1, 4, 9 or 16", "got 5")
 
 
 def _seen(K, dtype=torch.float64, N=20):

@@ -8,50 +8,21 @@ import warnings
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
-from cases_splat import random_splats, splats_from
+from cases_splat import random_splats
 from forked import forks, in_fork
 from torch.utils.data import DataLoader
 
 numba = pytest.importorskip("numba")
 
 from kfgs.splat import Tiles, accumulate_pixels, bin_tiles, composite  # noqa: E402
-from kfgs.splat.engines.contract import Splats  # noqa: E402
 from kfgs.splat.engines.cpu import engine as numba_cpu  # noqa: E402
-from kfgs.splat.engines.cpu.simd import bits, load  # noqa: E402
-from kfgs.splat.engines.cpu.square import (  # noqa: E402
-    BLOCK_SIDE,
-    BLOCKS,
-    CHUNK,
-    LANES,
-    SQUARE_SIDE,
-    X,
-    Y,
-    make_square,
-    pack_rows,
-    row_length,
-    start_square,
-    touched_blocks,
-    weigh_pixels,
-)
+from kfgs.splat.engines.cpu.square import CHUNK  # noqa: E402
 from kfgs.splat.engines.cpu.threads import run_bands  # noqa: E402
 
 DTYPES = [torch.float32, torch.float64]
 every_dtype = pytest.mark.parametrize("dtype", DTYPES)
-"""On both sides of: a few channels, one pass, two passes, registers at all."""
-
-
-def _needles(M, width, height, dtype, seed=3):
-    """Gaussians from a twentieth of a pixel to 200 pixels, up to 4000 times longer than wide, in all directions."""
-    g = torch.Generator().manual_seed(seed)
-    angle = torch.rand(M, generator=g, dtype=torch.float64) * torch.pi
-    sigmas = 10 ** (torch.rand(M, 2, generator=g, dtype=torch.float64) * 3.6 - 1.3)
-    axes = torch.stack([angle.cos(), -angle.sin(), angle.sin(), angle.cos()], 1).view(M, 2, 2) * sigmas[:, None]
-    means = torch.rand(M, 2, generator=g, dtype=torch.float64) * torch.tensor([width, height])
-    depths, opacities = torch.rand(2, M, generator=g, dtype=torch.float64)
-    return splats_from(means, axes @ axes.mT, 1 + depths, 0.05 + 0.9 * opacities, dtype)
 
 
 def _composite(projected, features, width, height, tile_size=16, **options):
@@ -94,72 +65,7 @@ def two_threads(many_bands):
     torch.set_num_threads(threads)
 
 
-# blocks ---------------------------------------------------------------------------------------------------------------
-
-
-def _pack(projected, dtype):
-    values = [v.to(dtype) for v in (projected.means2d, projected.conics, projected.opacities)]
-    splats = tuple(v.contiguous().view(-1).numpy() for v in values)
-    rows = np.full(len(values[2]) * row_length(0), np.nan, splats[0].dtype)
-    pack_rows(0, 1, splats, splats[0][:0], 0, np.empty(0, np.int64), rows)
-    return rows, [v.double().numpy() for v in values]
-
-
-@numba.njit
-def _look(rows, length, box, epsilon, touched, drawn):
-    """The blocks that each Gaussian is said to touch, and the pixels of each block where it is drawn, as bits."""
-    square = make_square(rows)
-    start_square(square, box)
-    state = square.state
-    for m in range(len(touched)):
-        touched[m] = touched_blocks(rows, m * length, square.corners, epsilon)
-        for block in range(BLOCKS):
-            x, y = load(state, X + block * LANES), load(state, Y + block * LANES)
-            _, _, _, alpha = weigh_pixels(rows, m * length, x, y)
-            drawn[m, block] = bits(alpha > 0)
-
-
-def _touched_and_drawn(rows, left, top):
-    """[M, 16] truth and [M, 16, 16] truth, for the square that begins at a pixel."""
-    M = len(rows) // row_length(0)
-    touched, drawn = np.zeros(M, np.uint32), np.zeros((M, BLOCKS), np.uint32)
-    _look(
-        rows,
-        row_length(0),
-        (left, top, left + SQUARE_SIDE, top + SQUARE_SIDE),
-        np.finfo(rows.dtype).eps,
-        touched,
-        drawn,
-    )
-    return touched[:, None] >> np.arange(BLOCKS) & 1 == 1, drawn[:, :, None] >> np.arange(LANES) & 1 == 1
-
-
-@every_dtype
-def test_no_pixel_outside_of_touched_blocks_is_drawn_however_it_rounds(dtype):
-    """Every Gaussian has alpha on 1/255, but for rounding, at the centre of pixel (20, 20), where its tip is.
-
-    That pixel is the first one of a block, or the last: the tip looks into the block from outside.
-    """
-    M = 20_000
-    projected = _needles(M, 40, 40, torch.float64, seed=8)
-    a, b, c = projected.conics.to(dtype).double().unbind(1)
-    g = torch.Generator().manual_seed(2)
-    length = 3.2 * torch.rand(M, generator=g)
-    along = torch.linalg.eigh(torch.stack([a, b, b, c], dim=1).view(M, 2, 2)).eigenvectors[..., 0]
-    size = (a * along[:, 0] ** 2 + 2 * b * along.prod(dim=1) + c * along[:, 1] ** 2).sqrt()
-    means2d = (20.5 + along * (length / size)[:, None]).to(dtype)
-    dx, dy = (20.5 - means2d.double()).unbind(1)
-    opacities = torch.exp((a * dx * dx + 2 * b * dx * dy + c * dy * dy) / 2) / 255
-    rows, _ = _pack(projected._replace(means2d=means2d, opacities=opacities), dtype)
-    on_edge = 0
-    for left, top in ((20, 20), (5, 5), (20, 5), (5, 20), (13, 9), (17, 17)):
-        touched, drawn = _touched_and_drawn(rows, left, top)
-        assert not (drawn.any(axis=2) & ~touched).any(axis=1).any()
-        i, j = 20 - top, 20 - left
-        on_edge += drawn[
-            :, i // BLOCK_SIDE * BLOCK_SIDE + j // BLOCK_SIDE, i % BLOCK_SIDE * BLOCK_SIDE + j % BLOCK_SIDE
-        ].sum()
-    assert 0.1 < on_edge / (6 * M) < 0.9  # the case is what it is meant to be: some are drawn there, some are not
+# broken Gaussians -----------------------------------------------------------------------------------------------------
 
 
 BROKEN = {
@@ -182,10 +88,7 @@ BROKEN = {
 
 @every_dtype
 @pytest.mark.parametrize("channels", [3, 40])
-@pytest.mark.parametrize(
-    "broken",
-    BROKEN,
-)
+@pytest.mark.parametrize("broken", BROKEN)
 def test_a_broken_gaussian_is_not_drawn_and_changes_no_gradient(broken, channels, dtype):
     M, width, height = 20, 21, 19
     projected, features = random_splats(M + 1, width, height, seed=5, dtype=dtype, channels=channels)
@@ -229,16 +132,6 @@ def test_rising_index_is_that_of_the_selected_rows(channels, many_bands):
         assert int((gradient != 0).any(dim=1).sum()) <= 60
 
 
-@pytest.mark.parametrize(("channels", "narrow"), [(1, 0), (3, 0), (11, 0), (26, 0), (27, 100), (33, 100), (70, 100)])
-def test_few_and_many_channels_are_done_alike(channels, narrow, monkeypatch):
-    """The kernels for few channels and those for many, on what both can do."""
-    projected, features = random_splats(300, 45, 37, seed=7, channels=channels)
-    expected = _gradients(projected, features, 45, 37)
-    monkeypatch.setattr(numba_cpu, "MOST_CHANNELS", narrow)
-    for a, b in zip(_gradients(projected, features, 45, 37), expected, strict=True):
-        torch.testing.assert_close(a, b, rtol=1e-11, atol=1e-11)
-
-
 # long lists -----------------------------------------------------------------------------------------------------------
 
 
@@ -280,18 +173,12 @@ def test_stop_in_the_middle_of_a_long_list(stop, channels):
 def test_nothing_is_looked_at_behind_what_is_opaque():
     count, opaque = 5 * CHUNK, CHUNK + 3
     means2d, conics = torch.full((count, 2), 8.0), torch.tensor([[1e-13, 0, 1e-13]]).repeat(count, 1)
-    opacities, features = torch.full((count,), 0.005), torch.ones(count, 1)
+    opacities, features = torch.full((count,), 0.005), torch.full((count, 1), float("nan"))
     opacities[opaque : opaque + 3] = 0.98
-    splats = Splats(means2d, conics, opacities, features, torch.zeros(1), None)
-    tiles = _everywhere(count, 16, 16, 16)
-    result = numba_cpu.ENGINE.forward(splats, tiles)
-    alphas = result.alphas
-    assert float(alphas.min()) > 0.999
-    assert result.seen.tolist() == [2 * CHUNK]  # of the one square
-    features = torch.full((count, 1), float("nan"))  # what is behind is not even read
     features[: 2 * CHUNK] = 1
-    maps, _ = composite(means2d, conics, opacities, features, tiles, engine="numba")
-    torch.testing.assert_close(maps[..., 0], alphas)
+    maps, alphas = composite(means2d, conics, opacities, features, _everywhere(count, 16, 16, 16), engine="numba")
+    assert float(alphas.min()) > 0.999
+    torch.testing.assert_close(maps[..., 0], alphas)  # what is behind is not even read
 
 
 # threads --------------------------------------------------------------------------------------------------------------

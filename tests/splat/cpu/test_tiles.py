@@ -52,21 +52,6 @@ def test_any_number_of_gaussians_fills_the_blocks(M):
     assert _same(_splats(M, torch.float32, M), 90, 60, 16)
 
 
-def _order(depths):
-    return numba_tiles.depth_order(torch.as_tensor(depths)).tolist()
-
-
-@pytest.mark.parametrize("dtype", DTYPES)
-def test_depths_are_sorted_like_torch_sorts(dtype):
-    g = torch.Generator().manual_seed(0)
-    special = torch.tensor([0.0, -0.0, NAN, INF, -INF, -NAN, 1e-45, -1e-45, 3e38, -3e38, 1.0, 1.0], dtype=dtype)
-    for size in (0, 1, 2, 3000):
-        plain = torch.randn(size, generator=g, dtype=dtype) * 10 ** torch.randint(-30, 30, (size,), generator=g)
-        depths = torch.cat([plain, plain[: size // 3], special[: size * 12]])
-        depths = depths[torch.randperm(len(depths), generator=g)]
-        assert _order(depths) == torch.sort(depths, stable=True).indices.tolist()
-
-
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_threads_and_shares_do_not_matter(dtype, monkeypatch):
     projected, threads = _splats(1, dtype, 700), torch.get_num_threads()
@@ -81,16 +66,6 @@ def test_threads_and_shares_do_not_matter(dtype, monkeypatch):
                 assert torch.equal(after.offsets, before.offsets)
     finally:
         torch.set_num_threads(threads)
-
-
-def test_pairs_outgrow_their_first_memory():
-    """150 Gaussians over all of 900 tiles: far more than the four pairs each that memory is first taken for."""
-    M, one = 150, torch.ones(150).double()
-    covs = 1e4**2 * torch.eye(2).double().repeat(M, 1, 1)
-    projected = splats_from(torch.full((M, 2), 50.0).double(), covs, one, 0.9 * one, torch.float32)
-    tiles = bin_tiles(projected, 240, 240, 8, engine="numba")
-    assert len(tiles.rows) == 900 * M
-    assert (tiles.rows.view(900, M) == torch.arange(M)).all()
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
