@@ -1,6 +1,5 @@
 """Fields of other programs. No samples could be had: the files are written here in the layouts of those programs."""
 
-import os
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +21,6 @@ from cases_foreign import (
     save_ply,
 )
 from messages import refused, tells
-from pickled import Call
 from published.foreign import (
     load_feature3dgs,
     load_foreign,
@@ -232,9 +230,3 @@ def test_features_keep_step_with_the_gaussians_that_are_left_of_a_real_splat(tmp
     expected = cosines_of(np.delete(values.numpy(), [7, 8, 4000], axis=0), text.double().numpy())
     np.testing.assert_allclose(found.numpy(), expected, atol=2e-5)
     refused(lambda: load_feature3dgs(tmp_path / "a.ply"), "a.ply", "semantic_0", "trained with features")
-
-
-def test_nothing_in_a_checkpoint_is_run(tmp_path: Path) -> None:
-    torch.save((Call(os.system, f"touch {tmp_path}/mark"), 30000), tmp_path / "chkpnt30000_langfeat_1.pth")
-    refused(lambda: load_occam(tmp_path), "chkpnt30000_langfeat_1.pth", "Nothing was run")
-    assert not (tmp_path / "mark").exists()

@@ -3,7 +3,6 @@
 import collections
 import json
 import math
-import pickle
 from pathlib import Path
 
 import numpy as np
@@ -180,13 +179,3 @@ def test_what_cannot_be_read_is_said(tmp_path: Path) -> None:
     path.write_bytes(write_gsplat(tmp_path / "b.pt", raw).read_bytes()[:-200])
     refused(lambda: read_splats(path), "a.pt", "cannot be read")
     assert find_format(tmp_path / "b.pt").NAME == "checkpoint"
-
-
-def test_nothing_in_a_checkpoint_is_run(tmp_path: Path) -> None:
-    class Attack:
-        def __reduce__(self):
-            return (Path.touch, (tmp_path / "ran",))
-
-    torch.save({"splats": Attack()}, tmp_path / "a.pt", pickle_module=pickle)
-    refused(lambda: read_splats(tmp_path / "a.pt"), "a.pt")
-    assert not (tmp_path / "ran").exists()

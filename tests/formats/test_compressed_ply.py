@@ -2,6 +2,7 @@ import gsply
 import numpy as np
 import pytest
 import torch
+from cases_gltf import random_cloud
 from oracles_packed import compressed_gaussian
 from oracles_precision import assert_within, precision, rotation_angles
 
@@ -12,14 +13,9 @@ from kfgs.formats.ply import read_ply_elements, write_ply_elements
 
 
 def _cloud(n: int = 700, degree: int = 3) -> Gaussians:
-    g = torch.Generator().manual_seed(5)
-    return Gaussians(
-        means=torch.randn(n, 3, generator=g) * torch.tensor([1.0, 5.0, 0.2]) + 3,
-        quats=torch.randn(n, 4, generator=g) * 3,
-        scales=(torch.randn(n, 3, generator=g) - 3).exp(),
-        opacities=torch.rand(n, generator=g),
-        sh=torch.randn(n, (degree + 1) ** 2, 3, generator=g).clamp(-4, 4),
-    )
+    cloud = random_cloud(n, degree)
+    means, scales = cloud.means * torch.tensor([1.0, 5.0, 0.2]) + 3, (4 * cloud.scales - 5).exp()
+    return cloud.replace(means=means, quats=3 * cloud.quats, scales=scales, sh=cloud.sh.clamp(-4, 4))
 
 
 def _assert_read_as_the_oracle_does(path, rows):

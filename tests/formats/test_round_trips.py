@@ -4,6 +4,7 @@ import gsply
 import numpy as np
 import pytest
 import torch
+from cases_gltf import random_cloud
 from oracles_precision import assert_within, precision
 
 from kfgs import Gaussians
@@ -56,17 +57,10 @@ def _camera(cloud: Gaussians, forward: tuple[float, float, float] = (0.0, 0.0, 1
 
 
 def _made(n: int = 500, labels: bool = True) -> Gaussians:
-    g = torch.Generator().manual_seed(11)
-    cloud = Gaussians(
-        means=torch.randn(n, 3, generator=g),
-        quats=torch.randn(n, 4, generator=g),
-        scales=torch.rand(n, 3, generator=g) * 0.1 + 0.01,
-        opacities=torch.rand(n, generator=g) * 0.9 + 0.05,
-        sh=torch.randn(n, 9, 3, generator=g) * 0.3,
-        labels=torch.randint(-1, 5, (n,), generator=g) if labels else None,
-    )
-    score = np.random.default_rng(0).uniform(size=n).astype(np.float32)
-    return cloud.replace(scores=score, names=("wall", "chair", "plant", "Tür", "x"))
+    cloud, g = random_cloud(n, 2), torch.Generator().manual_seed(11)
+    cloud = cloud.replace(scales=0.1 * cloud.scales, sh=0.3 * cloud.sh, scores=torch.rand(n, generator=g))
+    known = torch.randint(-1, 5, (n,), generator=g) if labels else None
+    return cloud.replace(labels=known, names=("wall", "chair", "plant", "Tür", "x"))
 
 
 def test_no_real_file_is_left_out(shared_data):

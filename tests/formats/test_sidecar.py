@@ -33,14 +33,6 @@ def _bend(path, **changes):
     np.savez(beside(path, LABELS), **{name: value for name, value in arrays.items() if value is not None})
 
 
-def test_labels_scores_and_names_come_back(path):
-    back = read_splats(path)
-    assert back.labels.tolist() == [-1, 0, 1, 2, -1, 0]
-    assert back.labels.dtype == torch.int64
-    np.testing.assert_allclose(back.scores, np.linspace(0, 1, 6), atol=1e-7)
-    assert back.names == CLASSES
-
-
 def test_without_them_the_file_still_opens(path):
     beside(path, LABELS).unlink()
     beside(path, NAMES).unlink()

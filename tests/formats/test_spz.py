@@ -5,6 +5,7 @@ import gsply
 import numpy as np
 import pytest
 import torch
+from cases_gltf import random_cloud
 from messages import refused
 from oracles_precision import assert_within, precision, rotation_angles
 from oracles_spz import legacy_payload, smallest_three
@@ -17,15 +18,9 @@ ROW = {"position": (256, -512, 768), "alpha": 51, "color": (0, 128, 255), "scale
 TURN = torch.tensor([1.0, -1.0, -1.0])
 
 
-def _cloud(n: int = 40, degree: int = 3, seed: int = 3) -> Gaussians:
-    g = torch.Generator().manual_seed(seed)
-    return Gaussians(
-        means=torch.randn(n, 3, generator=g) * torch.tensor([3.0, 1.0, 0.5]),
-        quats=torch.randn(n, 4, generator=g),
-        scales=torch.rand(n, 3, generator=g) * 0.4 + 0.01,
-        opacities=torch.rand(n, generator=g) * 0.9 + 0.05,
-        sh=torch.rand(n, (degree + 1) ** 2, 3, generator=g) * 1.6 - 0.8,
-    )
+def _cloud(n: int = 40, degree: int = 3) -> Gaussians:
+    cloud = random_cloud(n, degree)
+    return cloud.replace(means=cloud.means * torch.tensor([3.0, 1.0, 0.5]), sh=0.8 * cloud.sh.tanh())
 
 
 def _legacy(path, rows, packed=True, **options):

@@ -6,7 +6,6 @@ from messages import refused, tells
 
 from kfgs import Gaussians
 from kfgs.formats import find_format, read_splats, write_splats
-from kfgs.formats.encodings import morton_order
 from kfgs.formats.sidecar import LABELS, NAMES, beside
 from kfgs.formats.table import formats
 
@@ -74,24 +73,6 @@ def test_labels_of_an_older_file_do_not_stay(tmp_path):
     assert not beside(path, LABELS).is_file()
     write_splats(_cloud(), path)  # labels without names
     assert read_splats(path).names == ()
-
-
-@pytest.mark.parametrize("labels", [True, False])
-@pytest.mark.parametrize("file", ["a.compressed.ply", "a.sog", "a.ply", "a.spz", "a.splat", "a.glb"])
-def test_the_order_of_a_file_is_told(tmp_path, file, labels):
-    g = torch.Generator().manual_seed(2)
-    cloud = _cloud(40, labels).replace(means=torch.randn(40, 3, generator=g))
-    order = write_splats(cloud, tmp_path / file).order
-    back = read_splats(tmp_path / file)
-    assert (order is not None) == (file in ("a.compressed.ply", "a.sog"))
-    if order is None:
-        order = torch.arange(40)
-    else:
-        assert torch.equal(order, morton_order(cloud.means))
-        assert not torch.equal(order, torch.arange(40))
-    assert torch.equal(torch.cdist(back.means, cloud.means).argmin(1), order)
-    if labels:
-        assert torch.equal(back.labels, cloud.labels[order])
 
 
 def test_features_scores_and_labels_beyond_the_names_are_checked(tmp_path):
