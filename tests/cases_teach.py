@@ -3,14 +3,9 @@
 from pathlib import Path
 
 import torch
-from lseg_layout import random_state
+from lseg_layout import TINY, random_state
 
-from kfgs.teachers.lseg import LSegConfig, load_lseg
-
-TINY = LSegConfig(
-    width=32, depth=4, heads=4, window=64, position_grid=3, hooks=(0, 1, 2, 3), neck=(8, 12, 16, 20), fusion=12, dim=16,
-    text_width=32, text_layers=2, text_heads=4,
-)  # fmt: skip
+from kfgs.teachers.lseg import load_lseg
 
 
 class TinyLSeg:

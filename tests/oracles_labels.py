@@ -1,11 +1,7 @@
 """Slow, literal versions of Sec. 3.4 in numpy float64."""
 
 import numpy as np
-
-
-def cosine(a, b):
-    length = np.sqrt((a * a).sum()) * np.sqrt((b * b).sum())
-    return 0.0 if length == 0 else float((a * b).sum() / length)
+from oracles_quant import cosine
 
 
 def most_similar(features, rows):

@@ -4,11 +4,6 @@ import numpy as np
 from oracles_splat import render
 
 
-def cosine(a, b):
-    length = np.sqrt((a * a).sum()) * np.sqrt((b * b).sum())
-    return 0.0 if length == 0 else float((a * b).sum() / length)
-
-
 def blend_weights(means, quats, scales, opacities, viewmat, K, width, height):
     """w = T alpha of each Gaussian at each pixel, [H, W, N]: what a rendering shows of the i-th unit vector is w_i."""
     return render(means, quats, scales, opacities, np.eye(len(means)), viewmat, K, width, height)[0]

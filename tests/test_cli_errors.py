@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 from pathlib import Path
 
 import pytest
@@ -91,6 +92,28 @@ ERRORS = [
     ("view {splat} --out {o} --where picture --ask chair", ("words: expected a splat with classes", "kfgs attach")),
     ("view nowhere --out {o} --where picture", ("SOURCE: expected a field (RUN/field.kfgs",)),
     ("view {run} --out {o} --where picture --color {field}", ("--color: expected a splat file",)),
+    (
+        "evaluate {run} --protocol kfgs-poled",
+        ("--protocol: expected one of kfgs-pooled/1,", "did you mean kfgs-pooled/1"),
+    ),
+    ("evaluate {run} --truth /nothing", ("--truth: expected label pictures in /nothing", "not a folder")),
+    ("evaluate {run} --protocol kfgs-surface --labels own", ("--labels: expected none with kfgs-surface/1",)),
+    ("evaluate {run} --out {run}", ("--out: expected a file or nothing",)),
+    (
+        "evaluate {run} --protocol feature3dgs-teacher --truth /no",
+        ("--truth: expected a folder of the teacher's feature",),
+    ),
+    (
+        "evaluate {run}/../true --scene {room} --protocol kfgs-color",
+        ("color.ply: no such file; expected a colour splat",),
+    ),
+    ("evaluate {run} --protocol kfgs-color --truth {room}", ("--truth: expected none with kfgs-color/1",)),
+    ("evaluate {room}/features --scene {room} --protocol kfgs-surface", ("expected one with Gaussians",)),
+    ("evaluate {room}/features", ("--scene: expected a scene folder, got none",)),
+    ("evaluate {room} --scene {room}", ("expected a field or a finished run of kfgs",)),
+    ("evaluate nothing --scene {room}", ("expected a field or a finished run of kfgs",)),
+    ("evaluate {run}/color.ply --scene {room}", ("benchmarks/protocols.py",)),
+    ("evaluate {room}/features --scene {bare}", ("--text: expected a table of words, got none",)),
 ]
 
 
@@ -99,7 +122,7 @@ def places(desk, room, tmp_path_factory):
     """What the errors speak of.
 
     `plain` has classes but no colours, `alone` no names beside it, `four` has four Gaussians far away; a folder lies beside
-    `taken`; `one` is a path of one camera.
+    `taken`; `one` is a path of one camera; `bare` is a scene without a table of words.
     """
     folder, splat, labelled = tmp_path_factory.mktemp("errors"), desk / "my.ply", desk / "labelled.ply"
     cloud = read_splats(labelled)
@@ -112,6 +135,7 @@ def places(desk, room, tmp_path_factory):
     camera = {"w": 40, "h": 30, "fl_x": 30, "frames": [{"transform_matrix": torch.eye(4).tolist()}]}
     (folder / "one.json").write_text(json.dumps(camera))
     paths = {"room": room, "field": desk / "true" / "field.kfgs", "splat": splat, "labelled": labelled, "saved": same}
+    paths["bare"] = shutil.copytree(room, folder / "bare", ignore=shutil.ignore_patterns("text.npy"))
     paths |= {"run": desk / "run", "taken": folder / "taken", "one": folder / "one.json"}
     paths |= {name: folder / f"{name}.ply" for name in ("plain", "alone", "four")}
     return {name: str(path) for name, path in paths.items()}

@@ -142,17 +142,14 @@ def test_version_and_overview(capsys):
         assert hint in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    ("line", "choices"), [("fit scene --out run --method fast", ["uplift", "paper", "paper-full", "adc", "decouple"])]
-)
-def test_a_wrong_choice_is_told_the_words_that_can_be_given(line, choices, capsys, monkeypatch):
+def test_a_wrong_choice_is_told_the_words_that_can_be_given(capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "200")
     with pytest.raises(SystemExit) as stop:
-        cli.main(line.split())
+        cli.main(["fit", "scene", "--out", "run", "--method", "fast"])
     assert stop.value.code == 2
     said = capsys.readouterr()
     told = re.search(r"Expected one of \((.*?)\)", said.out + said.err)
-    assert re.findall(r"'(.*?)'", told[1]) == choices
+    assert re.findall(r"'(.*?)'", told[1]) == ["uplift", "paper", "paper-full", "adc", "decouple"]
 
 
 @pytest.mark.parametrize("flags", [(), ("-OO",)])

@@ -10,9 +10,8 @@ from kfgs import Camera, Gaussians, read_splats, write_splats
 from kfgs._origin import choose_origin, to_world
 from kfgs.cameras.similarity import Similarity
 from kfgs.formats.ply import read_ply, write_ply
-from kfgs.labels import InBox, Move, OfClass, OrientedBox
+from kfgs.labels import Move, OfClass, OrientedBox
 from kfgs.labels.edit_list import join
-from kfgs.labels.selection import InSphere
 from kfgs.scenes import align_by_cameras
 from kfgs.splat.transform import transform_gaussians
 
@@ -96,17 +95,6 @@ def test_origin_of_another_version_is_refused_and_its_advice_works(tmp_path):
         read_splats(tmp_path / "far.splat")
     (tmp_path / "far.splat.origin.json").unlink()
     assert len(read_splats(tmp_path / "far.splat")) == 1
-
-
-def test_places_of_a_rule_are_those_of_the_world(tmp_path):
-    world = far_file(tmp_path / "far.ply")
-    splats = read_splats(tmp_path / "far.ply")
-    low, high = UTM - 0.4, UTM + 0.7
-    inside = ((world >= low) & (world <= high)).all(1)
-    assert InBox(tuple(low), tuple(high)).select(splats).mask.tolist() == inside.tolist()
-    ball = np.linalg.norm(world - UTM, axis=1) <= 0.8
-    assert 0 < ball.sum() < len(ball)
-    assert InSphere(tuple(UTM), 0.8).select(splats).mask.tolist() == ball.tolist()
 
 
 def test_edits_and_joins_stay_in_the_world(tmp_path):

@@ -19,7 +19,6 @@ import kfgs
 from kfgs._files import (
     ASIDE,
     Names,
-    as_path,
     atomic_folder,
     atomic_path,
     check_output,
@@ -165,12 +164,6 @@ def test_what_cannot_be_written_is_refused_before_the_work(tmp_path):
             check_output("out", path, kind)
 
 
-def test_home_is_expanded_as_in_a_shell(tmp_path, monkeypatch):
-    monkeypatch.setenv("HOME", str(tmp_path))
-    assert as_path("~/scene") == as_path(Path("~/scene")) == tmp_path / "scene"
-    assert as_path("a/~/b~") == Path("a/~/b~")
-
-
 def test_no_public_function_reads_a_path_in_another_way():
     """A parameter that is a text or a path goes through `as_path`, so that `~` never becomes a folder of that name."""
     wrong = []
@@ -212,12 +205,6 @@ def test_the_second_process_is_told_and_a_kill_frees_the_lock(tmp_path):
 
 
 # JSON, texts, digests, words
-
-
-def test_json_round_trip(tmp_path):
-    value = {"Größe": [1, 2.5, None, True], "nested": {"a": "b"}}
-    write_json(tmp_path / "deep" / "value.json", value)
-    assert read_json(tmp_path / "deep" / "value.json") == value
 
 
 def test_json_refuses_what_json_cannot_hold(tmp_path):

@@ -158,10 +158,8 @@ def test_no_file_imports_a_later_file_of_its_package():
     ("file", "source", "message"),
     [
         ("kfgs/splat/tiles.py", "from ..quant import Codebook", "imports kfgs.quant"),
-        ("kfgs/quant/codebook.py", "def f():\n    from .. import metrics", "tiles.py|imports kfgs.metrics"),
         ("kfgs/gaussians.py", "from kfgs import Scene", "imports kfgs,"),
         ("kfgs/quant/codebook.py", "importlib.import_module('kfgs.fields.start')", "imports kfgs.fields.start"),
-        ("kfgs/cameras/__init__.py", "from ..gaussians import Gaussians", "imports kfgs.gaussians"),
         (
             "kfgs/labels/edit.py",
             "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from ..fields import start",
@@ -175,23 +173,8 @@ def test_no_file_imports_a_later_file_of_its_package():
 def test_a_breach_is_found(file, source, message):
     found = check(file, source)
     assert len(found) == 1
-    assert any(part in found[0] for part in message.split("|"))
+    assert message in found[0]
     assert found[0].startswith(f"{file}:{len(source.splitlines())} ")
-
-
-@pytest.mark.parametrize(
-    ("file", "source"),
-    [
-        (
-            "kfgs/fields/fit.py",
-            "from ..cameras import Camera\nfrom .start import point_spacing\nfrom .. import metrics",
-        ),
-        ("kfgs/viz/clouds.py", "if typing.TYPE_CHECKING:\n    from ..fields import SemanticField\nimport pyvista"),
-        ("kfgs/__main__.py", "from . import __version__\nfrom .cli import main"),
-    ],
-)
-def test_what_the_house_allows(file, source):
-    assert check(file, source) == []
 
 
 def test_importing_kfgs_loads_nothing_heavy():

@@ -6,10 +6,8 @@ import torch
 from messages import refused, tells
 
 from kfgs._check import as_tensor
-from kfgs.cameras import Camera
 from kfgs.formats import read_splats, write_splats
 from kfgs.gaussians import Gaussians
-from kfgs.splat import rasterize
 
 
 def cloud(count=4, features=2, degree=None, labelled=True):
@@ -140,13 +138,6 @@ def test_labels_of_any_whole_type_become_int64(dtype, tmp_path):
     for name in ("a.ply", "a.spz", "a.splat"):
         write_splats(labelled, tmp_path / name)
         assert read_splats(tmp_path / name).labels.tolist() == [0, 3, 1, 2]
-
-
-def test_mixed_types_are_named_where_they_meet():
-    camera = Camera(torch.eye(4), torch.tensor([[9.0, 0, 8], [0, 9, 8], [0, 0, 1]]), 16, 16)
-    mixed = cloud().replace(features=torch.zeros(4, 2, dtype=torch.float64))
-    parts = ("features", "float32", "from gaussians.means", "got torch.float64", ".to(")
-    refused(lambda: rasterize(mixed, camera), *parts)
 
 
 def test_a_cloud_is_not_an_index_and_not_an_array():

@@ -7,7 +7,7 @@ from messages import refused
 from oracles_color import ssim_windows
 from oracles_metrics import segmentation_scores
 
-from kfgs.metrics import MIB, ConfusionMatrix, feature_cosine, psnr, semantic_storage_bytes, ssim
+from kfgs.metrics import ConfusionMatrix, feature_cosine, psnr, ssim
 
 
 def labels(low, high, shape, seed):
@@ -138,21 +138,3 @@ def test_ssim_of_equal_pictures_is_one_even_when_black():
     assert float(ssim(black, black)) == 1
     batch = black.permute(2, 0, 1)[None]
     assert float(kornia.metrics.ssim(batch, batch, 11).mean()) < 1 - 1e-6  # kornia's default eps
-
-
-# storage
-
-DECODER_PARAMETERS = sum(i * o + o for i, o in [(9, 32), (32, 64), (64, 128), (128, 256), (256, 1024), (1024, 512)])
-
-
-def test_storage_reproduces_table_1():
-    """The rows of Table 1 that give their number of Gaussians to 0.1k, "MB" being MiB."""
-    assert DECODER_PARAMETERS == 831_744
-    assert round(semantic_storage_bytes(29_600, 512) / MIB, 1) == 59.4  # "just decouple"
-    assert round(semantic_storage_bytes(28_700, 512) / MIB, 1) == 57.6  # "decouple+ADC"
-    # "decouple+ADC+SC": 13.0. With all of K_max = 100 codewords the sum is 13.06; pruning leaves fewer, and any
-    # average from 43 to 93 codewords prints as 13.0
-    full = semantic_storage_bytes(110_500, 9, DECODER_PARAMETERS, 100 * 512) / MIB
-    assert full == pytest.approx(13.0, abs=0.07)
-    for codewords in (43, 93):
-        assert round(semantic_storage_bytes(110_500, 9, DECODER_PARAMETERS, codewords * 512) / MIB, 1) == 13.0

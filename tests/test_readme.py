@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from cases_color import make_field, make_splat
-from cases_teach import TINY, save_checkpoint
+from cases_teach import save_checkpoint
+from lseg_layout import TINY
 
 import kfgs
 from kfgs import FeatureFolder, SemanticField, Uplift, fit, load_label_set, load_scene, read_splats, write_splats

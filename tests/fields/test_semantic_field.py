@@ -2,6 +2,7 @@ from dataclasses import replace
 from functools import cache
 
 import numpy as np
+import oracles_quant
 import oracles_uplift
 import pytest
 import torch
@@ -115,7 +116,7 @@ def test_views_of_a_fused_field_blend_votes():
     parts = [x.numpy() for x in (cloud.means, cloud.quats, cloud.scales, cloud.opacities)]
     weights = oracles_uplift.blend_weights(*parts, view.viewmat.numpy(), view.K.numpy(), view.width, view.height)
     features, rows = cloud.features.numpy() @ linear().basis.T.double().numpy(), classes.double().numpy()
-    cosines = np.array([[oracles_uplift.cosine(f, row) for row in rows] for f in features])
+    cosines = np.array([[oracles_quant.cosine(f, row) for row in rows] for f in features])
     preferred = sorted({int(cosines[i].argmax()) for i in range(11)})
     assert len(preferred) >= 3
     votes = np.zeros((12, len(rows)))

@@ -31,11 +31,13 @@ def test_sh_is_stored_channel_major():
 
 
 def test_ascii_of_windows_has_other_words_for_nan(tmp_path):
-    head = "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nend_header\n"
-    (tmp_path / "a.ply").write_text(head + "1 1.#QNAN # 2\n-nan(ind) -1.#IND000\n")  # y is not 1
+    head = "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\n"
+    rows = "property uchar red\nend_header\n1 1.#QNAN 255 # 2\n-nan(ind) -1.#IND000 7\n"
+    (tmp_path / "a.ply").write_text(head + rows)  # y is not 1
     columns = read_ply(tmp_path / "a.ply")
     assert columns["x"][0] == 1
     assert np.isnan([columns["x"][1], *columns["y"]]).all()
+    assert (columns["red"].dtype, columns["red"].tolist()) == (np.uint8, [255, 7])
 
 
 LITTLE = b"ply\nformat binary_little_endian 1.0\n"

@@ -3,6 +3,7 @@ import pytest
 import torch
 from cases_clouds import random_cloud
 from messages import refused
+from oracles_selection import rotation
 
 from kfgs.labels import Duplicate, Move
 from kfgs.splat import covariance_3d, evaluate_sh
@@ -21,15 +22,6 @@ def scene(n=10):
     return made.replace(means=2 * made.means, quats=quats, scales=0.2 * made.scales, sh=made.sh - 0.5, scores=scores)
 
 
-def oracle_matrix(motion):
-    """The 3 x 3 matrix of a motion's rotation, by Rodrigues' formula in plain numpy."""
-    axis, degrees = motion.get("rotation", ("z", 0))
-    k, a = np.array((0, 0, 1) if axis == "z" else axis, float), np.deg2rad(degrees)
-    k /= np.linalg.norm(k)
-    K = np.array([[0, -k[2], k[1]], [k[2], 0, -k[0]], [-k[1], k[0], 0]])
-    return np.eye(3) + np.sin(a) * K + (1 - np.cos(a)) * K @ K
-
-
 @pytest.mark.parametrize("motion", MOTIONS)
 def test_move_against_the_equation(motion):
     splats = scene()
@@ -38,7 +30,8 @@ def test_move_against_the_equation(motion):
     assert moved[~mask].means.equal(g[~mask].means)
     assert moved[~mask].sh.equal(g[~mask].sh)
     assert moved.labels.equal(g.labels)
-    R, s = oracle_matrix(motion), motion.get("scale", 1.0)
+    axis, degrees = motion.get("rotation", ("z", 0))
+    R, s = rotation((0, 0, 1) if axis == "z" else axis, degrees), motion.get("scale", 1.0)
     x, o = g.means[mask].numpy(), g.opacities[mask].numpy()
     pivot = motion.get("pivot", (o[:, None] * x).sum(0) / o.sum())
     expected = s * (x - pivot) @ R.T + pivot + np.array(motion.get("translation", (0, 0, 0)))

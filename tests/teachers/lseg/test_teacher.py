@@ -6,20 +6,17 @@ from pathlib import Path
 
 import pytest
 import torch
-from lseg_layout import random_state
+from lseg_layout import TINY, random_state
 from messages import refused
 from torch import Tensor
 from torch.nn import functional
 
-from kfgs.teachers.lseg import LSeg, LSegConfig, LSegOptions, load_lseg
+from kfgs.teachers.lseg import LSeg, LSegOptions, load_lseg
 from kfgs.teachers.lseg.keys import network_from_state, text_from_state
+from kfgs.teachers.lseg.windows import scaled_size, window_starts
 from kfgs.teachers.protocol import Teacher, identify
 from kfgs.teachers.tokenizer import tokenize
 
-TINY = LSegConfig(
-    width=32, depth=4, heads=2, window=64, position_grid=3, hooks=(0, 1, 2, 3), neck=(8, 16, 24, 32), fusion=12, dim=10,
-    text_width=16, text_layers=2, text_heads=2, context=77, vocabulary=49408,
-)  # fmt: skip
 STATE = random_state(TINY, torch.Generator().manual_seed(0))
 
 
@@ -51,6 +48,21 @@ def test_size_of_the_map(size, picture_size: tuple[int, int], expected: tuple[in
     assert LSegOptions(size=size).map_size(*picture_size) == expected
 
 
+def test_sizes_windows_and_forwards_of_the_released_script() -> None:
+    """360 x 480: 1 + 2 + 4 + 6 = 13 windows, and their mirrors, 26 runs of the network."""
+    assert [scaled_size(360, 480, s, 480) for s in LSegOptions().scales] == [
+        (293, 390),
+        (390, 520),
+        (488, 650),
+        (683, 910),
+    ]
+    assert scaled_size(480, 360, 1.25, 480) == (650, 488)
+    assert scaled_size(1, 1000, 1.0, 480) == (1, 520)
+    assert [window_starts(n, 480) for n in (390, 480, 481, 800, 801, 910)] == [
+        [0], [0], [0, 320], [0, 320], [0, 320, 640], [0, 320, 640],
+    ]  # fmt: skip
+
+
 def test_paper_runs_26_times_and_fast_once() -> None:
     for options, size, runs in ((LSegOptions(), (48, 64), 26), (LSegOptions.fast(), (90, 101), 1)):
         teacher, calls = tiny(options), []
@@ -67,7 +79,7 @@ def test_text_is_unit_rows_of_the_tower_in_the_order_of_the_prompts() -> None:
     prompts = ["wall", "a", "door"] + ["b" * (k % 5) for k in range(80)]  # more than are embedded at a time
     rows = teacher.encode_text(prompts)
     expected = text_from_state(STATE, TINY, source="tiny")(input_ids=tokenize(prompts)).text_embeds
-    assert rows.shape == (83, 10)
+    assert rows.shape == (83, 16)
     torch.testing.assert_close(rows.norm(dim=1), torch.ones(83), rtol=1e-6, atol=0)
     torch.testing.assert_close(rows, functional.normalize(expected, dim=1), rtol=1e-4, atol=1e-5)
     torch.testing.assert_close(teacher.encode_text(("door",))[0], rows[2], rtol=1e-4, atol=1e-5)
@@ -112,7 +124,7 @@ def test_load_lseg_reads_both_towers_of_one_file_and_combines_fast_with_single_s
     assert teacher.options == LSegOptions(scales=(1.0,), flip=False)
     expected = tiny(teacher.options).encode_image(picture(20, 30))
     torch.testing.assert_close(teacher.encode_image(picture(20, 30)), expected, rtol=0, atol=0)
-    assert teacher.encode_text(["wall", "swivel chair"]).shape == (2, 10)
+    assert teacher.encode_text(["wall", "swivel chair"]).shape == (2, 16)
     assert len(teacher.identity["weights"]) == 64
     assert load_lseg(path, config=TINY).options == LSegOptions()
     assert load_lseg(path, config=TINY, fast=True).options == LSegOptions.fast()
