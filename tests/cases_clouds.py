@@ -5,15 +5,15 @@ import torch
 from kfgs.gaussians import Gaussians
 
 
-def balls(means, labels=None, **changes):
+def balls(means, labels=None, *, scale=0.05, opacity=0.9, **changes):
     """Small balls at the given places."""
     means = torch.as_tensor(means, dtype=torch.float32)
     n = len(means)
     return Gaussians(
         means=means,
         quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1),
-        scales=torch.full((n, 3), 0.05),
-        opacities=torch.full((n,), 0.9),
+        scales=torch.full((n, 3), scale),
+        opacities=torch.full((n,), opacity),
         labels=None if labels is None else torch.as_tensor(labels, dtype=torch.int64),
     ).replace(**changes)
 

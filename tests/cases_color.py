@@ -4,10 +4,10 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from cases_clouds import balls
 
 from kfgs.fields import Identity, SemanticField
 from kfgs.formats import write_splats
-from kfgs.gaussians import Gaussians
 from kfgs.labels import load_label_set
 from kfgs.scenes import load_scene
 from kfgs.viz import palette
@@ -18,10 +18,7 @@ SH0 = 0.28209479177387814  # of the constant spherical harmonic
 def surface(room: Path):
     """Gaussians on the room's surface, and the true class of each."""
     data = np.load(room / "surface.npz")
-    n = len(data["points"])
-    flat = torch.tensor([1.0, 0, 0, 0]).repeat(n, 1)
-    cloud = Gaussians(torch.from_numpy(data["points"]), flat, torch.full((n, 3), 0.06), torch.full((n,), 0.95))
-    return cloud, torch.from_numpy(data["labels"].astype(np.int64))
+    return balls(data["points"], scale=0.06, opacity=0.95), torch.from_numpy(data["labels"].astype(np.int64))
 
 
 def make_field(room: Path, folder: Path) -> Path:

@@ -5,7 +5,7 @@ from functools import cache
 import numpy as np
 import torch
 from cases_clouds import balls as cloud
-from cases_quant import made_autoencoder
+from cases_quant import first_channels
 
 from kfgs._rows import unit_rows
 from kfgs.cameras import Camera
@@ -15,7 +15,7 @@ from kfgs.labels import LabelSet
 from kfgs.quant.codebook import Codebook
 from kfgs.quant.linear import fit_linear_latents
 from kfgs.splat.sh import rgb_to_sh0
-from kfgs.viewer.meaning import SplatMeaning
+from kfgs.viewer.meaning import FieldMeaning, SplatMeaning
 from kfgs.viewer.state import Exploration
 
 DIM, WORDS = 16, 12
@@ -33,14 +33,7 @@ def codebook():
 
 @cache
 def autoencoder():
-    """Written down, not fitted: the first twelve channels and back."""
-    into, out = torch.eye(WORDS, DIM), torch.eye(DIM, WORDS)
-    return made_autoencoder(
-        encoder=((into, torch.zeros(WORDS)),),
-        decoder=((out, torch.zeros(DIM)), (torch.eye(DIM), torch.zeros(DIM))),
-        low=0.0,
-        high=1.0,
-    )
+    return first_channels(WORDS, DIM)
 
 
 @cache
@@ -127,3 +120,11 @@ def line(distance=1.0, **options):
     color = cloud([[0.25, 0, 5], [1, 0, 5], [2.5, 0, 5], [6, 0, 5], [60, 0, 5]], sh=sh)
     made = SplatMeaning(splat_file(semantic, np.array([0.8, 0.6, 0.4], np.float32)))
     return Exploration(made, color, distance=distance, **options)
+
+
+def room():
+    """A fused field, its classes and views, and a colour cloud in its place."""
+    generator = torch.Generator().manual_seed(2)
+    means = torch.rand(60, 3, generator=generator) * 2 + torch.tensor([-1, -1, 4])
+    color = cloud(means, sh=rgb_to_sh0(torch.rand(60, 3, generator=generator))[:, None])
+    return Exploration(FieldMeaning(field("fused"), classes()), color, cameras=cameras(), distance=0.4)

@@ -35,9 +35,7 @@ def raw_values() -> dict[str, torch.Tensor]:
 def splats_of(values: torch.Tensor, raw: dict[str, torch.Tensor] | None = None) -> Gaussians:
     """The Gaussians of `raw_values`, activated here by the definitions."""
     raw = raw or raw_values()
-    return Gaussians(
-        raw["xyz"], raw["quats"], raw["scales"].exp(), 1 / (1 + torch.exp(-raw["opacity"][:, 0])), features=values
-    )
+    return Gaussians(raw["xyz"], raw["quats"], raw["scales"].exp(), raw["opacity"][:, 0].sigmoid(), features=values)
 
 
 def save_capture(path: Path, features: list[torch.Tensor], *, place: int = 6, raw: dict | None = None) -> Path:

@@ -3,6 +3,7 @@
 import json
 import struct
 
+import numpy as np
 import torch
 
 from kfgs import Gaussians
@@ -46,3 +47,12 @@ def bent_gltf(tmp_path, cloud=None, **changes):
             holder[last] = value
     path.write_text(json.dumps(root))
     return path
+
+
+def ply_columns(count, degree=0, base="f_dc_"):
+    """Random values of a PLY of 3DGS, in the order of its columns."""
+    names = [*"xyz", *(f"{base}{i}" for i in range(3) if base)]
+    names += [*(f"f_rest_{i}" for i in range(3 * (degree + 1) ** 2 - 3)), "opacity"]
+    names += [*(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
+    rng = np.random.default_rng(5)
+    return {name: (rng.normal(size=count) - 3 * name.startswith("scale")).astype("f4") for name in names}

@@ -2,9 +2,9 @@
 
 import numpy as np
 import torch
+from cases_clouds import balls
 from cases_web import SECONDS
 
-from kfgs.gaussians import Gaussians
 from kfgs.viewer import Exploration, SplatMeaning
 
 NAMES = ("table", "chair", "<b>{{ 1 + 1 }}</b>")  # the last must stay words
@@ -17,15 +17,8 @@ def _cloud(count, spread, seed, labels=None):
     places = torch.tensor([[2.0, 0, 0], [-2.0, 0, 0], [0, 2.5, 0]]).repeat_interleave(count, dim=0)
     offsets = torch.randn(3 * count, 3, generator=generator)
     means = places + spread * offsets / offsets.norm(dim=1, keepdim=True)
-    n = len(means)
-    return Gaussians(
-        means=means,
-        quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1),
-        scales=torch.full((n, 3), 0.08),
-        opacities=torch.full((n,), 0.9),
-        sh=torch.rand(n, 1, 3, generator=generator),
-        labels=None if labels is None else torch.arange(3).repeat_interleave(count),
-    )
+    labels = None if labels is None else torch.arange(3).repeat_interleave(count)
+    return balls(means, labels, scale=0.08, sh=torch.rand(len(means), 1, 3, generator=generator))
 
 
 def exploration(names=NAMES):

@@ -14,3 +14,9 @@ def made_autoencoder(encoder, decoder, low=0.0, high=1.0) -> Autoencoder:
         for i, (weight, bias) in enumerate(layers):
             state |= {f"{name}.{i}.weight": weight, f"{name}.{i}.bias": bias}
     return Autoencoder.from_state_dict(state)
+
+
+def first_channels(latents: int, dim: int, high: float = 1.0) -> Autoencoder:
+    """Written down, not fitted: latents are the first channels, held to 0 ... high, and decode to them."""
+    out = (torch.eye(dim, latents), torch.zeros(dim)), (torch.eye(dim), torch.zeros(dim))
+    return made_autoencoder(((torch.eye(latents, dim), torch.zeros(latents)),), out, 0.0, high)

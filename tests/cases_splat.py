@@ -13,17 +13,11 @@ TOLERANCE = {torch.float32: 2e-5, torch.float64: 1e-10}  # absolute, for values 
 
 
 def random_splats(
-    M: int,
-    width: int,
-    height: int,
-    *,
-    seed: int,
-    dtype: torch.dtype = torch.float64,
-    opacities: tuple[float, float] = (0.05, 0.95),
-    sigma: tuple[float, float] = (0.7, 6.0),  # pixels
-    channels: int = 3,
+    M, width, height, *, seed, dtype=torch.float64, opacities=(0.05, 0.95), sigma=(0.7, 6.0), channels=3
 ) -> tuple[Projected, Tensor]:
-    """M projected Gaussians in and around an image, a third of them at equal depth, and their features [M, D]."""
+    """M projected Gaussians in and around an image, a third of them at equal depth, and their features [M, D].
+
+    `sigma` is in pixels."""
     g = torch.Generator().manual_seed(seed)
 
     def uniform(low: float, high: float, *shape: int) -> Tensor:
@@ -52,15 +46,7 @@ def splats_from(means2d: Tensor, covs: Tensor, depths: Tensor, opacities: Tensor
     return Projected(*(v.to(dtype) for v in (means2d, conics, depths, opacities, extents)), index)
 
 
-def a_camera(
-    width: int = 24,
-    height: int = 18,
-    *,
-    focal: tuple[float, float] = (22.0, 19.0),
-    principal: tuple[float, float] = (10.3, 8.1),
-    seed: int = 0,
-    dtype: torch.dtype = torch.float64,
-) -> Camera:
+def a_camera(width=24, height=18, *, focal=(22.0, 19.0), principal=(10.3, 8.1), seed=0, dtype=torch.float64) -> Camera:
     """A camera somewhere, turned somehow, with unequal focal lengths and a principal point off the middle."""
     g = torch.Generator().manual_seed(seed)
     R = torch.linalg.qr(torch.randn(3, 3, generator=g, dtype=torch.float64)).Q
@@ -72,17 +58,11 @@ def a_camera(
 
 
 def gaussians_before(
-    camera: Camera,
-    N: int,
-    *,
-    seed: int,
-    depth: tuple[float, float] = (1.0, 10.0),
-    spread: float = 1.2,  # 1: as wide as the picture
-    sigma: tuple[float, float] = (0.02, 0.15),  # of the depth
-    opacities: tuple[float, float] = (0.2, 0.8),
-    channels: int = 3,
+    camera, N, *, seed, depth=(1.0, 10.0), spread=1.2, sigma=(0.02, 0.15), opacities=(0.2, 0.8), channels=3
 ) -> Gaussians:
-    """N Gaussians at random places of the camera's view, and somewhat around it, in world coordinates."""
+    """N Gaussians at random places of the camera's view, and somewhat around it, in world coordinates.
+
+    `spread` is 1 where they fill the picture; `sigma` is a share of the depth."""
     g = torch.Generator().manual_seed(seed)
     dtype = camera.K.dtype
 

@@ -51,8 +51,8 @@ CASES = {
     "one channel": Case(1),
     "9 channels": Case(9),
     "40 channels": Case(40),
-    "130 channels": Case(130),
-    "indexed": Case(9, rows_of_features=20, manners=True),
+    "130 channels": Case(130, count=8),
+    "indexed": Case(9, count=12, rows_of_features=20, manners=True),
     "indexed, more rows than Gaussians": Case(40, rows_of_features=90),
     "tiles of 5": Case(tile_size=5),
     "tiles of 12": Case(tile_size=12),
@@ -248,17 +248,13 @@ def run_projection(count: int, low_pass: float, tile_size: int, device: str) -> 
         shown = cloud.to(place, dtype).replace(**dict(zip(OF_FRAME[:4], given, strict=True)))
         seen = project(shown, camera, low_pass=low_pass, engine=engine)
         g = torch.Generator().manual_seed(8)
-        cotangents = [
-            torch.randn(count, *value.shape[1:], generator=g)[seen.index.cpu()].to(value) for value in seen[:4]
-        ]
+        cotangents = [torch.randn(count, *v.shape[1:], generator=g)[seen.index.cpu()].to(v) for v in seen[:4]]
         grads = torch.autograd.grad(seen[:4], given, cotangents)
         named = dict(zip(PROJECTED, seen, strict=False)) | dict(zip(OF_PROJECTION, grads, strict=True))
         return seen, {name: value.detach() for name, value in named.items()}
 
     (seen, actual), (truth, expected) = run(torch.float32, device, "triton"), run(torch.float64, "cpu", "reference")
-    facts = {
-        name: largest((actual[name].cpu().double() - value) / (1 + value.abs())) for name, value in expected.items()
-    }
+    facts = {name: largest((actual[name].cpu().double() - v) / (1 + v.abs())) for name, v in expected.items()}
     for name in OF_PROJECTION:
         facts[name] = largest(actual[name].cpu().double() - expected[name]) / (largest(expected[name]) or 1.0)
     seen = Projected(*(value.detach() for value in seen))
@@ -322,15 +318,7 @@ BUILDS = {
     "differentiate, 1 channel, tiles of 5": Build("differentiate", 1, 80, tile_size=5, indexed=False),
     **{f"{kernel}, sm_90": Build(kernel, 0, 90) for kernel in OTHERS},
 }
-OF_SEE = (
-    "ends",
-    "means2d",
-    "conics",
-    "depths",
-    "out_opacities",
-    "extents",
-    "index",
-)  # arguments that the first call lacks
+OF_SEE = "ends", "means2d", "conics", "depths", "out_opacities", "extents", "index"  # which the first call lacks
 
 
 def compile_ahead(build: Build) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 import numpy as np
 import torch
+from cases_clouds import balls
 from PIL import Image
 
 from kfgs.gaussians import Gaussians
@@ -30,12 +31,5 @@ def paint_room(folder, scene, *, voxel: float = 0.04, stride: int = 1) -> Gaussi
     order = np.argsort(sizes, kind="stable")
     cells = np.floor(points[order] / voxel).astype(np.int64)
     first = order[np.unique(cells, axis=0, return_index=True)[1]]
-    N = len(first)
-    return Gaussians(
-        means=torch.from_numpy(points[first]).float(),
-        quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(N, 1),
-        scales=torch.full((N, 3), 0.45 * voxel),
-        opacities=torch.full((N,), 0.95),
-        sh=torch.from_numpy((colors[first] - 0.5) / 0.28209479177387814).float()[:, None],
-        labels=torch.from_numpy(labels[first].astype(np.int64)),
-    )
+    sh = torch.from_numpy((colors[first] - 0.5) / 0.28209479177387814).float()[:, None]
+    return balls(points[first], labels[first], scale=0.45 * voxel, opacity=0.95, sh=sh)

@@ -37,9 +37,8 @@ def one_process(room: Path, out: Path) -> Path:
     classes = load_label_set(room / "classes.json", room / "text.npy")
     truth = true_labels(scene, room / "labels", "test")
     field = SemanticField.load(out / "field.kfgs")
-    report = score_scene(
-        segment_scene(field, scene, classes, out / "segmented", pictures=0, truth=truth), truth, classes
-    )
+    labels = segment_scene(field, scene, classes, out / "segmented", pictures=0, truth=truth)
+    report = score_scene(labels, truth, classes)
     (out / "scores.json").write_text(json.dumps({"scene": room.name, **report.to_json()}, indent=2) + "\n")
     return out
 

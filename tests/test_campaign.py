@@ -28,10 +28,7 @@ record = Record(Path({out!r}), Path({scratch!r}))
 def run(code, folder, *, minutes=4):
     """Run code in a process of its own, from which the campaign may fork; the lines of its record."""
     start = START.format(benchmarks=str(BENCHMARKS), out=str(folder / "out"), scratch=str(folder / "scratch"))
-    alone = os.environ | {
-        "OMP_NUM_THREADS": "1",
-        "NUMBA_NUM_THREADS": "1",
-    }  # many forks with threads each wait for each other
+    alone = os.environ | dict.fromkeys(("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")  # forks with threads would wait
     done = subprocess.run(
         [sys.executable, "-c", start + code], capture_output=True, text=True, timeout=60 * minutes, env=alone
     )
@@ -44,13 +41,13 @@ def findings(lines):
 
 
 def test_mutants_of_every_file_are_read_or_refused(tmp_path):
-    lines = run("files.run_files(record, seed=18, seconds=3000, most=1500, batch=12)", tmp_path, minutes=14)
+    lines = run("files.run_files(record, seed=18, seconds=3000, most=570, batch=5)", tmp_path, minutes=8)
     assert findings(lines) == []
     readers = {line["reader"] for line in lines}
     assert len(readers) == 23
-    assert sum(line.get("mutants", 0) for line in lines) == 1500
-    assert sum(line.get("refused", 0) for line in lines) > 300
-    assert sum(line.get("read", 0) for line in lines) > 100
+    assert sum(line.get("mutants", 0) for line in lines) == 570
+    assert sum(line.get("refused", 0) for line in lines) > 120
+    assert sum(line.get("read", 0) for line in lines) > 40
 
 
 BROKEN = """
@@ -59,7 +56,7 @@ def broken(path):
     data = path.read_bytes()
     exec(dict({faults!r}).get(len(data), ""))
 readers.READERS["words"] = broken
-files.run_files(record, seed=1, seconds=60, only="words.txt", most=60, batch=60)
+files.run_files(record, seed=1, seconds=60, only="words.txt", most=20, batch=20)
 """
 FAULTS = {  # of a mutant of so many bytes
     "error": (13, "raise KeyError('wall')"),
@@ -77,13 +74,13 @@ def test_each_fault_of_a_reader_is_found_with_its_mutant(tmp_path, monkeypatch):
 
     lines = run(BROKEN.format(faults=list(FAULTS.values())), tmp_path)
     sound = b"wall\nchair;armchair\n"
-    mutants = [make_mutant(sound, "fields/classes/words.txt", 1, number) for number in range(60)]
+    mutants = [make_mutant(sound, "fields/classes/words.txt", 1, number) for number in range(20)]
     expected = {(i, what) for i, data in enumerate(mutants) for what, (size, _) in FAULTS.items() if len(data) == size}
     found = findings(lines)
     assert {(line["number"], line["what"]) for line in found} == expected
     assert {what for _, what in expected} == set(FAULTS)
     (batch,) = [line for line in lines if line["kind"] == "files"]
-    assert batch["read"] + batch["refused"] + len(found) == batch["mutants"] == 60  # also after crashes
+    assert batch["read"] + batch["refused"] + len(found) == batch["mutants"] == 20  # also after crashes
     kept = {path.name: path.read_bytes() for path in (tmp_path / "out" / "findings").rglob("*words.txt")}
     assert all(data == mutants[int(name.split("-")[1])] for name, data in kept.items())
     assert len(kept) >= len(FAULTS)

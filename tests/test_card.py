@@ -1,52 +1,28 @@
 import importlib
-from dataclasses import dataclass, field
+from collections import namedtuple
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from cases_quant import made_autoencoder
-from torch import Tensor
 
 from kfgs import Camera, Gaussians, SemanticField, rasterize
-from kfgs._card import LONGEST, html_card, short_repr, short_value
+from kfgs._card import LINE, LONGEST, html_card, short_repr, short_value
 from kfgs.fields import Autoencoded
 from kfgs.labels import EditList, LabelSet, Remove, Selection
 from kfgs.quant import Codebook, LinearLatents
 from kfgs.quant.codebook import CodebookReport, Nearest
 
 
-def test_a_card_escapes_everything_and_leaves_out_what_is_none():
-    card = html_card("<b>Scene</b>", {"<i>name": "a & <script>", "points": 12345, "missing": None})
-    assert "<script>" not in card
-    assert "<i>" not in card
-    assert "<b>" not in card
-    assert "a &amp; &lt;script&gt;" in card
-    assert "12,345" in card
-    assert "missing" not in card
-    assert card.count("<tr>") == 2
-    assert len(html_card("x", {"words": "word " * 10_000})) < 600
-
-
-def test_a_line_shows_tensors_by_shape_and_type():
-    @dataclass
-    class Thing:
-        rows: Tensor
-        names: tuple[str, ...]
-        hidden: int = field(default=3, repr=False)
-        nothing: float | None = None
-
-        __repr__ = short_repr
-
-    assert repr(Thing(torch.zeros(4, 2), ("a", "b"))) == "Thing(rows=[4, 2] float32, names=('a', 'b'))"
-    assert repr(Thing(torch.zeros(0, 2, dtype=torch.float64), ("a",) * 9)).endswith("[0, 2] float64, names=9 of str)")
-
-
-def test_no_value_is_long():
+def test_no_value_and_no_line_is_long_and_none_is_left_out():
     for value in ("x\n" * 1000, {str(i): i for i in range(9)}, [torch.zeros(3)] * 5, {"a": "b" * 500}, [], {}):
         shown = short_value(value)
         assert len(shown) <= LONGEST
         assert "\n" not in shown
+    assert short_value({str(i): i for i in range(9)}) == "9 entries"
+    assert len(short_repr(namedtuple("Many", "a b c d e f g h")(*["word " * 50] * 8))) <= LINE
+    assert "missing" not in html_card("x", {"missing": None})
 
 
 def test_paths_and_rows_say_what_they_are():

@@ -7,13 +7,7 @@ import pytest
 import torch
 from messages import refused, tells
 
-from kfgs._check import as_array, as_tensor, check_choice, check_range, check_shapes, check_whole, class_indices
-
-
-def test_sizes_are_bound_by_name():
-    arrays = ("means", torch.zeros(5, 3), "N 3"), ("features", np.zeros((5, 7)), "N D"), ("labels", None, "N")
-    assert check_shapes(*arrays, ("loss", torch.tensor(1.0), "")) == {"N": 5, "D": 7}
-    assert check_shapes(("confusion", torch.zeros(4, 4), "C C")) == {"C": 4}
+from kfgs._check import as_array, as_tensor, check_range, check_shapes, check_whole, class_indices
 
 
 @pytest.mark.parametrize(
@@ -31,12 +25,6 @@ def test_a_shape_that_disagrees_names_what_bound_the_size(arguments, parts):
         check_shapes(*((f"x{i}", torch.zeros(shape), axes) for i, (shape, axes) in enumerate(arguments)))
     with pytest.raises(TypeError, match=tells("means:", "[N, 3]", "got list", "torch.as_tensor")):
         check_shapes(("means", [[1, 2, 3]], "N 3"))
-
-
-def test_choice():
-    check_choice("engine", "numba", ("auto", "numba"))
-    with pytest.raises(ValueError, match=tells("engine:", "'auto', 'numba'", "got 'Numba'", "did you mean 'numba'?")):
-        check_choice("engine", "Numba", iter(("auto", "numba")))
 
 
 @pytest.mark.parametrize(
@@ -144,22 +132,10 @@ def test_tensors_become_arrays():
 NAMES = ["wall", "Window blind", "chair", "armchair"]
 
 
-def test_a_name_is_its_place():
-    assert [class_indices(name, NAMES) for name in NAMES] == [(0,), (1,), (2,), (3,)]
-
-
 def test_a_name_in_another_case():
     assert class_indices("window BLIND", NAMES) == (1,)
     assert class_indices("chair", ["Chair", "chair", "CHAIR"]) == (1,)  # its own case wins
-    with pytest.raises(ValueError, match=tells("class:", "got 'chAir'", "'CHAIR' or 'Chair' or 'chair'")):
-        class_indices("chAir", ["Chair", "chair", "CHAIR"])
-
-
-def test_several_labels_of_one_name():
-    names = ["chair", "wall", "chair", "Chair"]
-    assert class_indices("chair", names) == (0, 2)
-    assert class_indices("WALL", names) == (1,)
-    assert class_indices("CHAIR", ["Chair", "wall", "Chair"]) == (0, 2)
+    refused(lambda: class_indices("chAir", ["Chair", "chair", "CHAIR"]), "'CHAIR' or 'Chair' or 'chair'")
 
 
 def test_what_is_not_a_name_is_refused():

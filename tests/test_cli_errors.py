@@ -157,7 +157,7 @@ def test_bad_input_ends_with_1_one_line_and_no_files(line, message, places, tmp_
 
 
 @pytest.mark.parametrize(
-    "line", ["fly", "fit", "fit x --out y --method gpu", "edit a.ply", "attach a b --out c.ply --by magic"]
+    "line", ["fly", "fit", "fit x --out y --method gpu", "edit a.ply", "attach a b --out c --by magic"]
 )
 def test_wrong_usage_ends_with_2(line):
     with pytest.raises(SystemExit) as stop:

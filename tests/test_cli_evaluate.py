@@ -43,9 +43,8 @@ def test_a_run_remembers_its_scene_and_its_score_is_the_protocols(run, words, as
     capsys.readouterr()
     assert main() == 0
     said = capsys.readouterr().out.splitlines()[0]
-    expected = KfgsPooled().score(
-        FieldMethod(SemanticField.load(run / "field.kfgs")), *asked, lambda _: words.embeddings
-    )
+    rows = words.embeddings
+    expected = KfgsPooled().score(FieldMethod(SemanticField.load(run / "field.kfgs")), *asked, lambda _: rows)
     assert said == str(expected)
     kept = json.loads((tmp_path / "s.json").read_text())
     assert kept["scores"] == dict(expected.scores)
@@ -77,9 +76,7 @@ def test_every_protocol_end_to_end(words, shown, run, room, tmp_path, capsys):
     assert long.count("\n") >= 5
 
 
-def test_the_rule_for_labels_is_that_of_the_protocol_unless_asked_and_is_said(
-    run, room, words, asked, tmp_path, capsys
-):
+def test_the_rule_for_labels_is_that_of_the_protocol_unless_asked(run, room, words, asked, tmp_path, capsys):
     field = SemanticField.load(run)
     expected = {
         rule: KfgsPooled().score(FieldMethod(field, own_labels=rule == "own"), *asked, lambda _: words.embeddings)
@@ -99,7 +96,5 @@ def test_the_rule_for_labels_is_that_of_the_protocol_unless_asked_and_is_said(
     assert (own.options["labels"], own.changed) == ("own", ("texts", "labels"))
     method = FieldMethod(field, own_labels=False)
     pooled = open_question(room)
-    assert (
-        evaluate(method, pooled, encode=words).options["labels"] == "nearest"
-    )  # it keeps its rule, unless one is asked
+    assert evaluate(method, pooled, encode=words).options["labels"] == "nearest"  # its rule, unless one is asked
     assert evaluate(method, pooled, encode=words, labels="own").scores == expected["own"].scores

@@ -114,9 +114,7 @@ def test_two_runs_of_kfgs_give_the_same_bytes(room, tmp_path):
         assert (two / file.relative_to(one)).read_bytes() == file.read_bytes(), file
 
 
-@pytest.mark.parametrize(
-    "words", [["fit", "scene", "--out", ""], ["color", "scene", "--out="], ["select", "", "a.ply"]]
-)
+@pytest.mark.parametrize("words", [["fit", "scene", "--out", ""], ["color", "a", "--out="], ["select", "", "a.ply"]])
 def test_an_empty_path_is_not_the_current_folder(words, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     refused(words, capsys, "empty", "write . for this folder")

@@ -92,7 +92,5 @@ def test_a_path_through_the_cameras_of_a_scene_without_pictures(desk, tmp_path):
     (tmp_path / "scene").mkdir()
     shutil.copytree(desk / "scene" / "sparse", tmp_path / "scene" / "sparse")
     assert segment(desk, tmp_path / "out", "--path", tmp_path / "scene", "--frames", 4) == 0
-    assert sorted(one.name for one in (tmp_path / "out" / "predicted").iterdir()) == [
-        f"path_{i:04d}.png" for i in range(4)
-    ]
+    assert sorted(one.name for one in (tmp_path / "out/predicted").iterdir()) == [f"path_{i:04d}.png" for i in range(4)]
     assert read(tmp_path / "out" / "predicted" / "path_0000.png").shape == (60, 80)

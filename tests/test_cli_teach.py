@@ -18,14 +18,9 @@ QUICK = ["--steps", "3", "--method", "adc"]
 
 
 @pytest.fixture(scope="module")
-def scene(room):
-    return room
-
-
-@pytest.fixture(scope="module")
-def pictures(scene):
+def pictures(room):
     """The training pictures by their stems."""
-    loaded = load_scene(scene)
+    loaded = load_scene(room)
     return {loaded.stem(i): loaded.image_paths[i] for i in loaded.views("train")}
 
 
@@ -35,18 +30,18 @@ def weights(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def maps(scene, weights, tmp_path_factory):
+def maps(room, weights, tmp_path_factory):
     """The scene's maps, made in one go."""
     folder = tmp_path_factory.mktemp("maps") / "features"
-    assert main(["features", str(scene), *TEACHER, str(weights), "--out", str(folder)]) == 0
+    assert main(["features", str(room), *TEACHER, str(weights), "--out", str(folder)]) == 0
     return folder
 
 
 @pytest.fixture(scope="module")
-def run(scene, maps, tmp_path_factory):
+def run(room, maps, tmp_path_factory):
     """A field fitted to stored maps."""
     out = tmp_path_factory.mktemp("run")
-    assert main(["fit", str(scene), "--features", str(maps), "--out", str(out), *QUICK]) == 0
+    assert main(["fit", str(room), "--features", str(maps), "--out", str(out), *QUICK]) == 0
     return out
 
 
@@ -62,9 +57,9 @@ def test_maps_are_lsegs_of_the_photographs(pictures, weights, maps):
         np.testing.assert_allclose(found, expected.half().numpy(), rtol=2e-3, atol=2e-3)
 
 
-def test_check_reports_maps_that_do_not_fit(scene, pictures, maps, tmp_path, capsys):
-    assert main(["features", str(scene), "--out", str(maps)]) == 0
-    assert f"next: kfgs fit {scene} --out run --features {maps}" in capsys.readouterr().out
+def test_check_reports_maps_that_do_not_fit(room, pictures, maps, tmp_path, capsys):
+    assert main(["features", str(room), "--out", str(maps)]) == 0
+    assert f"next: kfgs fit {room} --out run --features {maps}" in capsys.readouterr().out
     out = tmp_path / "maps"
     shutil.copytree(maps, out)
     gone, broken, turned, *good = pictures
@@ -72,7 +67,7 @@ def test_check_reports_maps_that_do_not_fit(scene, pictures, maps, tmp_path, cap
     np.save(out / f"{broken}.npy", np.full_like(np.load(out / f"{broken}.npy"), np.nan))
     np.save(out / f"{turned}.npy", np.load(out / f"{turned}.npy").transpose(1, 0, 2))
     capsys.readouterr()
-    assert main(["features", str(scene), "--out", str(out)]) == 1
+    assert main(["features", str(room), "--out", str(out)]) == 1
     said, error = capsys.readouterr()
     assert error.startswith(f"error: --out: expected a map that fits for each of the {len(pictures)} views of split")
     assert error.count("\n") == 1
@@ -82,9 +77,9 @@ def test_check_reports_maps_that_do_not_fit(scene, pictures, maps, tmp_path, cap
     assert not any(name in said for name in good)
 
 
-def test_maps_and_words_of_a_scene_are_made_in_one_go(scene, pictures, weights, maps, tmp_path, capsys):
+def test_maps_and_words_of_a_scene_are_made_in_one_go(room, pictures, weights, maps, tmp_path, capsys):
     copy = tmp_path / "scene"
-    shutil.copytree(scene, copy, ignore=shutil.ignore_patterns("features", "text.npy", "classes.json"))
+    shutil.copytree(room, copy, ignore=shutil.ignore_patterns("features", "text.npy", "classes.json"))
     assert main(["features", str(copy), "--words", "door,wall", *TEACHER, str(weights)]) == 0
     assert f"wrote:\n  {copy / 'text.safetensors'}\n  {copy / 'features'}" in capsys.readouterr().out
     assert load_label_set(copy / "text.safetensors").names == ("door", "wall")
@@ -94,9 +89,7 @@ def test_maps_and_words_of_a_scene_are_made_in_one_go(scene, pictures, weights, 
 
 def test_words_of_the_same_weights_query_the_field(run, weights, tmp_path, capsys):
     table = tmp_path / "text.safetensors"
-    assert (
-        main(["features", "--words", "wooden door,stone wall,ground", *TEACHER, str(weights), "--out", str(table)]) == 0
-    )
+    assert main(["features", "--words", "wooden door,stone wall,ground", *TEACHER, str(weights), f"--out={table}"]) == 0
     assert "3 classes, 16 channels each, by lseg, as '{}'" in capsys.readouterr().out
     field = SemanticField.load(run / "field.kfgs")
     assert main(["select", "wooden door", str(run / "field.kfgs"), "--text", str(table)]) == 0

@@ -1,9 +1,9 @@
 import pytest
 import torch
+from cases_clouds import balls
 from messages import refused
 
 from kfgs.cli.edit_syntax import Edits, parse_edits
-from kfgs.gaussians import Gaussians
 from kfgs.labels import Extract, Move, OfClass, Recolor, Remove, connected_parts
 
 
@@ -55,10 +55,7 @@ def test_a_number_behind_a_class_is_a_part_of_it():
 def rows(*sizes):
     """A row of Gaussians of class 1 for each size, 0.1 apart; rows are 10 apart. Beside them a row of class 0."""
     means = torch.tensor([(10.0 * i, 0.1 * j, 0.0) for i, n in enumerate((*sizes, 40)) for j in range(n)])
-    n = len(means)
-    labels = (torch.arange(n) < sum(sizes)).long()
-    quats = torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1)
-    return Gaussians(means, quats, torch.ones(n, 3), torch.ones(n), labels=labels).replace(names=("wall", "chair"))
+    return balls(means, torch.arange(len(means)) < sum(sizes), names=("wall", "chair"))
 
 
 def test_parts_are_numbered_as_select_lists_them():

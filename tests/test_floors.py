@@ -38,24 +38,14 @@ FLOOR = {place: floor for floor, places in enumerate(FLOORS) for place in places
 TYPES_ONLY = {("viz", "fields"), ("viewer", "fields")}  # viz may take a field as an argument
 
 THIRD_PARTY = {
-    "pycolmap": "kfgs/scenes/",
-    "pyvista": "kfgs/viz/",
-    "vtk": "kfgs/viz/",
-    "vtkmodules": "kfgs/viz/",
-    "trame_vtk": "kfgs/viz/",
-    "numba": "kfgs/splat/engines/",
-    "llvmlite": "kfgs/splat/engines/",
-    "triton": "kfgs/splat/engines/",
-    "transformers": "kfgs/teachers/",
-    "tokenizers": "kfgs/teachers/",
-    "huggingface_hub": "kfgs/teachers/",
-    "IPython": "kfgs/viewer/",
-    "anywidget": "kfgs/viewer/",
-    "traitlets": "kfgs/viewer/",
-    "dask": "kfgs/batch/",
-    "distributed": "kfgs/batch/",
-    "dask_jobqueue": "kfgs/batch/",
-}
+    name: f"kfgs/{folder}/"
+    for folder, names in {
+        "scenes": "pycolmap", "viz": "pyvista vtk vtkmodules trame_vtk", "splat/engines": "numba llvmlite triton",
+        "teachers": "transformers tokenizers huggingface_hub", "viewer": "IPython anywidget traitlets",
+        "batch": "dask distributed dask_jobqueue",
+    }.items()
+    for name in names.split()
+}  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ NOT_YET = {  # what is above its aim: a change may lower these numbers, and neve
     "quant": 1_261, "base": 1_250,
 }  # fmt: skip
 SCRIPTS = 4_000  # lines of the viewer's JavaScript
+TESTS = 33_300  # lines of Python in tests/: whoever lowers it brings it nearer to 32_000, and nobody raises it
 PUBLIC, TOP, COMMAND, OPTIONS = 170, 40, 14, 109  # names, of kfgs itself, commands, options; limits: 170, 40, 14, 110
 PACKAGES = [folder for folder in AIM if "/" not in folder and folder not in ("cli", "base")]
 
@@ -32,8 +33,8 @@ def room(file: Path) -> str:
     return next((name for name in sorted(AIM, key=len, reverse=True) if inside.startswith(f"{name}/")), "base")
 
 
-def lines(pattern: str) -> dict[Path, int]:
-    return {file: len(file.read_text(encoding="utf-8").splitlines()) for file in ROOT.rglob(pattern)}
+def lines(pattern: str, folder: Path = ROOT) -> dict[Path, int]:
+    return {file: len(file.read_text(encoding="utf-8").splitlines()) for file in folder.rglob(pattern)}
 
 
 @pytest.mark.parametrize("folder", AIM)
@@ -48,29 +49,23 @@ def test_the_viewers_scripts_are_within_their_budget():
     assert sum(lines("*.js").values()) <= SCRIPTS
 
 
+def test_who_adds_tests_names_the_tests_that_go():
+    assert sum(lines("*.py", Path(__file__).parent).values()) <= TESTS
+
+
 def test_public_names_are_few():
-    packages = [importlib.import_module(f"kfgs.{name}") for name in PACKAGES] + [
-        importlib.import_module("kfgs.metrics")
-    ]
+    packages = [importlib.import_module(f"kfgs.{name}") for name in (*PACKAGES, "metrics")]
     assert len(kfgs.__all__) <= TOP
     assert len({name for package in packages for name in package.__all__} | set(kfgs.__all__)) <= PUBLIC
 
 
-def options(kind: object) -> int:
-    """The options that a parameter of a command makes: those of its fields, if it is a dataclass."""
-    if is_dataclass(kind):
-        return sum(
-            options(parameter.annotation) for parameter in inspect.signature(kind, eval_str=True).parameters.values()
-        )
-    return 1
+def options(thing: object) -> int:
+    """The options that the parameters of a command make: those of its fields, where one is a dataclass."""
+    kinds = [one.annotation for one in inspect.signature(thing, eval_str=True).parameters.values()]
+    return sum(options(kind) if is_dataclass(kind) else 1 for kind in kinds)
 
 
 def test_commands_and_their_options_are_few():
-    counts = {
-        name: sum(
-            options(parameter.annotation) for parameter in inspect.signature(command, eval_str=True).parameters.values()
-        )
-        for name, command in COMMANDS.items()
-    }
+    counts = {name: options(command) for name, command in COMMANDS.items()}
     assert len(counts) <= COMMAND
     assert sum(counts.values()) <= OPTIONS, counts

@@ -44,7 +44,7 @@ def test_an_attack_runs_nothing_and_imports_nothing(tmp_path, attack, container)
         assert "\n" not in str(error)  # noqa: PT017
     assert not marker.exists()
     assert not {
-        name for name in set(sys.modules) - modules if name.partition(".")[0] not in ("torch", "numpy", "encodings")
+        name for name in set(sys.modules) - modules if name.split(".")[0] not in ("torch", "numpy", "encodings")
     }
 
 

@@ -80,9 +80,7 @@ def test_commands_make_the_maps_that_the_teacher_makes(backbone, room, tmp_path,
     scene = load_scene(room)
     truth = torch.cat([load_label_map(room / "labels" / f"{scene.stem(i)}.png").flatten() for i in scene.views("test")])
     most = float(truth[truth >= 0].bincount().max() / (truth >= 0).sum())
-    assert (
-        float(re.search(r"accuracy ([\d.]+) \(kfgs-pooled/1", said)[1]) > most + 0.05
-    )  # better than one class for all
+    assert float(re.search(r"accuracy ([\d.]+) \(kfgs-pooled/1", said)[1]) > most + 0.05  # better than one class
     monkeypatch.chdir(ROOT)
     teacher = load_teacher("benchmarks.real_teacher:RealTeacher", weights)
     manifest = json.loads((out / "features.json").read_text())

@@ -107,9 +107,9 @@ def test_transfer_prints_every_row(monkeypatch, capsys):
 def test_streaming_measures_each_stage(room, tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
     read, table = load_scene(room), tmp_path / "table.json"
-    write_splats(gaussians_from_points(read.points, colors=read.colors, sh_degree=0), tmp_path / "splat.ply")
+    write_splats(gaussians_from_points(read.points, colors=read.colors, sh_degree=0), tmp_path / "a.ply")
     words = ["--images", 11, "--size", 12, 16, "--channels", 7, "--epochs", 2, "--json", table]
-    words += ["--splat", tmp_path / "splat.ply", "--folder", tmp_path / "kept"]
+    words += ["--splat", tmp_path / "a.ply", "--folder", tmp_path / "kept"]
     streaming = start(monkeypatch, "streaming", room, *words)
     apart = streaming.run_apart  # a process costs seconds of imports
 

@@ -19,9 +19,7 @@ def test_each_fisheye_coefficient_in_closed_form(i):
     assert fold_radius(Distortion("kannala_brandt", tuple(coefficients))) == pytest.approx(math.tan(1))
 
 
-@pytest.mark.parametrize(
-    ("i", "value"), [(0, -1 / 3), (1, -1 / 5), (4, -1 / 7), (5, 1.0), (6, 1 / 3), (7, 1 / 5)], ids=str
-)
+@pytest.mark.parametrize(("i", "value"), [(0, -1 / 3), (1, -1 / 5), (4, -1 / 7), (5, 1.0), (6, 1 / 3), (7, 1 / 5)])
 def test_each_radial_coefficient_in_closed_form(i, value):
     # r + k r^n as above; r / (1 + k r^n) has slope zero where 1 + (1 - n) k r^n = 0, at r = 1 for k = 1 / (n - 1)
     coefficients = [0.0] * 8

@@ -6,7 +6,7 @@ import pycolmap
 import pytest
 import torch
 from kornia.geometry.camera import PinholeCamera
-from messages import tells
+from messages import refused, tells
 from oracles_cameras import HEIGHT, LENSES, WIDTH, colmap_camera, colmap_pixels, project_pinhole
 
 from kfgs.cameras import Camera, Distortion, from_kornia, project_points, to_kornia
@@ -156,16 +156,11 @@ def test_moving_world_and_camera_together_changes_nothing():
 def test_refusals():
     camera, bent = posed(), posed(Distortion("brown_conrady", (0.1, 0, 0, 0)))
     points = torch.ones(2, 3, dtype=torch.float64)
-    with pytest.raises(ValueError, match=tells("points:", "[N, 3]", "got (2, 2)")):
-        project_points(camera, points[:, :2])
-    with pytest.raises(TypeError, match=tells("points:", "got torch.int64", ".float()")):
-        world_to_camera(camera, points.long())
-    with pytest.raises(ValueError, match=tells("near:", "got -1")):
-        project_points(camera, points, near=-1)
-    with pytest.raises(ValueError, match=tells("camera:", "got brown_conrady", "'posed'")):
-        unproject_depth(bent, torch.ones(camera.size))
-    with pytest.raises(ValueError, match=tells("depth:", "[64, 96]", "got (96, 64)")):
-        unproject_depth(camera, torch.ones(WIDTH, HEIGHT))
+    refused(lambda: project_points(camera, points[:, :2]), "points:", "[N, 3]", "got (2, 2)")
+    refused(lambda: world_to_camera(camera, points.long()), "points:", "got torch.int64", ".float()", error=TypeError)
+    refused(lambda: project_points(camera, points, near=-1), "near:", "got -1")
+    refused(lambda: unproject_depth(bent, torch.ones(camera.size)), "camera:", "got brown_conrady", "'posed'")
+    refused(lambda: unproject_depth(camera, torch.ones(WIDTH, HEIGHT)), "depth:", "[64, 96]", "got (96, 64)")
     with pytest.raises(TypeError, match=tells("depth:", "got torch.int32")):
         unproject_depth(camera, torch.ones(camera.size, dtype=torch.int32))
 
@@ -196,13 +191,10 @@ def test_to_kornia_and_back():
 
 def test_what_kornia_cannot_hold_is_refused():
     bent = replace(CAMERAS[1], distortion=Distortion("kannala_brandt", (0.1, 0, 0, 0)))
-    with pytest.raises(ValueError, match=tells("camera:", "got kannala_brandt", "'b.png'")):
-        to_kornia([CAMERAS[0], bent])
-    with pytest.raises(ValueError, match=tells("cameras:", "got none")):
-        to_kornia([])
+    refused(lambda: to_kornia([CAMERAS[0], bent]), "camera:", "got kannala_brandt", "'b.png'")
+    refused(lambda: to_kornia([]), "cameras:", "got none")
     pinhole = to_kornia(CAMERAS)
     stacked = PinholeCamera(pinhole.intrinsics[:, None], pinhole.extrinsics[:, None], pinhole.height, pinhole.width)
-    with pytest.raises(ValueError, match=tells("pinhole.intrinsics:", "[2, 4, 4]", "got (2, 1, 4, 4)")):
-        from_kornia(stacked)
+    refused(lambda: from_kornia(stacked), "pinhole.intrinsics:", "[2, 4, 4]", "got (2, 1, 4, 4)")
     with pytest.raises(ValueError, match=tells("width:", "got 28.")):
         from_kornia(to_kornia(CAMERAS[:1]).scale(torch.tensor([0.3], dtype=torch.float64)))

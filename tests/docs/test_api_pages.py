@@ -151,6 +151,7 @@ def test_what_users_are_shown_to_import_is_on_a_page_with_an_example(path):
     for name in sorted(names):
         if name.rpartition(".")[0] not in ("kfgs", *PACKAGES):  # rarely needed: from its module, which may change
             assert callable(value_of(name))
+            assert "._" not in name, f"{name} is private"
             continue
         entry = entry_of(name)
         assert entry is not None, f"{name}: no entry on an API page"
@@ -236,9 +237,8 @@ def test_the_python_of_many_scenes_runs(inside, monkeypatch):
 
 def test_no_page_has_python_that_no_test_runs():
     pages = [path for path in PAGES.parent.rglob("*.md") if not {"_build", "_ext"} & set(path.parts)]
-    have = {
-        path.relative_to(PAGES.parent).with_suffix("").as_posix() for path in pages if "```python\n" in path.read_text()
-    }
+    pages = [path for path in pages if "```python\n" in path.read_text()]
+    have = {path.relative_to(PAGES.parent).with_suffix("").as_posix() for path in pages}
     assert have == {*AS_THEY_STAND, *ELSEWHERE, *WITH_DATA}
 
 

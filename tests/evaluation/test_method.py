@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
-from cases_quant import made_autoencoder
+from cases_quant import first_channels
 from messages import refused
 
 from kfgs import Camera, Gaussians
@@ -29,12 +29,7 @@ def _field(mode: str) -> SemanticField:
     if mode in ("codebook", "autoencoder"):
         decoder = Codewords(Codebook(torch.eye(3, DIM) * 3))
     if mode == "autoencoder":
-        autoencoder = made_autoencoder(
-            encoder=((torch.eye(4, DIM), torch.zeros(4)),),
-            decoder=((torch.eye(DIM, 4), torch.zeros(DIM)), (torch.eye(DIM), torch.zeros(DIM))),
-            low=0.0,
-            high=3.0,
-        )
+        autoencoder = first_channels(4, DIM, high=3.0)
         decoder = Autoencoded(decoder.codebook, autoencoder)
         features = torch.cat([autoencoder.encode(torch.eye(3, DIM) * 3).detach(), torch.zeros(1, 4)])
     means = torch.tensor([[-1.25, 0, 5], [0, 0, 5], [1.25, 0, 5], [50, 0, 5]])

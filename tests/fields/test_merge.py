@@ -1,10 +1,11 @@
 import math
 
+import cases_clouds
 import numpy as np
 import oracles_merge
 import pytest
 import torch
-from messages import tells
+from messages import refused, tells
 
 from kfgs.cameras import Camera
 from kfgs.fields import merge, merge_gaussians
@@ -38,15 +39,8 @@ def random_cloud(n=300, channels=5, kinds=4, seed=0):
 
 
 def balls(means, features, scale=0.1, opacity=0.3):
-    n = len(means)
-    quats = torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1)
-    return Gaussians(
-        torch.as_tensor(means, dtype=torch.float32),
-        quats,
-        torch.full((n, 3), scale),
-        torch.full((n,), opacity),
-        torch.as_tensor(features, dtype=torch.float32),
-    )
+    features = torch.as_tensor(features, dtype=torch.float32)
+    return cases_clouds.balls(means, scale=scale, opacity=opacity, features=features)
 
 
 def covariances(cloud):
@@ -74,9 +68,7 @@ def test_merged_balls_smaller_than_a_pixel_are_antialiased_and_cover_as_much(one
     cloud = balls([[0.0, 0, 4], [0.002, 0, 4], [0, 0.003, 4]], [[1.0, 0]] * 3, 0.005, 0.5).replace(antialiased=True)
     merged = merge_gaussians(cloud, torch.ones(3), 1).gaussians
     camera = Camera(torch.eye(4), torch.tensor([[60.0, 0, 8.2], [0, 60, 7.9], [0, 0, 1]]), 16, 16)  # 0.08 pixels wide
-    before = sum(
-        float(rasterize(one, camera, engine="reference").alpha.sum()) for one in (cloud[0], cloud[1], cloud[2])
-    )
+    before = sum(float(rasterize(one, camera, engine="reference").alpha.sum()) for one in cloud)
     after = float(rasterize(merged, camera, engine="reference").alpha.sum())
     assert merged.antialiased
     assert after == pytest.approx(before, rel=0.05)  # alpha below 1/255 is not drawn
@@ -200,12 +192,9 @@ def test_the_order_of_gaussians_does_not_matter(one_kind, seed):
 
 def test_wrong_input_is_named():
     cloud, weights = random_cloud(10)
-    with pytest.raises(ValueError, match=tells("gaussians:", "[N, d]", "got None")):
-        merge_gaussians(cloud.replace(features=None), weights, 5)
-    with pytest.raises(ValueError, match=tells("weights:", "got none")):
-        merge_gaussians(cloud, torch.zeros(10), 5)
-    with pytest.raises(ValueError, match=tells("weights:", "[N]", "N = 10", "got (3,)")):
-        merge_gaussians(cloud, torch.ones(3), 5)
+    refused(lambda: merge_gaussians(cloud.replace(features=None), weights, 5), "gaussians:", "[N, d]", "got None")
+    refused(lambda: merge_gaussians(cloud, torch.zeros(10), 5), "weights:", "got none")
+    refused(lambda: merge_gaussians(cloud, torch.ones(3), 5), "weights:", "[N]", "N = 10", "got (3,)")
     for maximum in (0, 2.0):
         with pytest.raises(ValueError, match=tells("maximum:", f"got {maximum}")):
             merge_gaussians(cloud, weights, maximum)

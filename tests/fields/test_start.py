@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 import torch
-from messages import tells
+from messages import refused
 
 from kfgs.fields import gaussians_from_points
 from kfgs.fields.start import point_spacing
@@ -55,10 +55,8 @@ def test_duplicates_share_the_spacing_of_their_place():
 def test_two_points_and_identical_points():
     two = gaussians_from_points(torch.tensor([[0.0, 0, 0], [0, 0, 2]]), 1)
     torch.testing.assert_close(two.scales, torch.full((2, 3), 2.0))
-    with pytest.raises(ValueError, match=tells("points:", "got 5")):
-        gaussians_from_points(torch.ones(5, 3), 1)
-    with pytest.raises(ValueError, match=tells("points:", "got 0")):
-        gaussians_from_points(torch.ones(0, 3), 1)
+    refused(lambda: gaussians_from_points(torch.ones(5, 3), 1), "points:", "got 5")
+    refused(lambda: gaussians_from_points(torch.ones(0, 3), 1), "points:", "got 0")
 
 
 def test_a_colour_field_shows_its_points_colours():
@@ -102,5 +100,4 @@ def test_colours_stay_with_their_points_when_some_are_dropped():
     ],
 )
 def test_wrong_arguments(change, message):
-    with pytest.raises(ValueError, match=tells(*message)):
-        gaussians_from_points(**({"points": cloud(10), "colors": torch.zeros(10, 3)} | change))
+    refused(lambda: gaussians_from_points(**({"points": cloud(10), "colors": torch.zeros(10, 3)} | change)), *message)

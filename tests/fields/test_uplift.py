@@ -1,16 +1,18 @@
 from dataclasses import replace
+from functools import partial
 
+import cases_clouds
 import numpy as np
 import oracles_answers
 import oracles_uplift
 import pytest
 import torch
-from cases_quant import made_autoencoder
+from cases_quant import first_channels
 from cases_splat import a_camera, gaussians_before
-from messages import tells
+from messages import refused
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from kfgs import Camera, Gaussians
+from kfgs import Camera
 from kfgs._rows import unit_rows
 from kfgs.cameras import resize_map
 from kfgs.fields import Autoencoded, Codewords, Identity, SemanticField, UpliftConfig, fuse_views, uplift, uplift_maps
@@ -47,10 +49,7 @@ def ahead(n=1, size=8):
     return [Camera(torch.eye(4), K, size, size, f"view {i}") for i in range(n)]
 
 
-def balls(means, scale=0.15, opacity=0.9):
-    n = len(means)
-    quats = torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1)
-    return Gaussians(torch.tensor(means), quats, torch.full((n, 3), scale), torch.full((n,), opacity))
+balls = partial(cases_clouds.balls, scale=0.15)
 
 
 def blend_weights(gaussians, views):
@@ -116,9 +115,8 @@ def test_latents_are_chosen_by_directions_and_pixels():
 def test_uniform_maps_give_their_feature_to_every_gaussian_that_is_shown(corrections):
     views, gaussians = cameras(), cloud()
     feature = torch.tensor([2.0, 0, -1, 2, 0])
-    found = uplift_maps(
-        gaussians, views, [feature.expand(*v.size, 5) for v in views], UpliftConfig(corrections=corrections)
-    )
+    maps, config = [feature.expand(*v.size, 5) for v in views], UpliftConfig(corrections=corrections)
+    found = uplift_maps(gaussians, views, maps, config)
     shown = found.known
     assert shown.sum() >= 8
     assert found.decoder.latent == 1
@@ -160,7 +158,7 @@ def row_of_balls(n=24):
     g = torch.Generator().manual_seed(0)
     means = torch.stack([torch.linspace(-1.5, 1.5, n), torch.arange(n) % 2 * 0.2 - 0.1, torch.full((n,), 3.0)], dim=1)
     truth = torch.nn.functional.normalize(torch.randn(4, 6, generator=g)[torch.arange(n) // 6], dim=1)
-    return balls(means.tolist(), scale=0.12, opacity=0.8), truth
+    return balls(means, scale=0.12, opacity=0.8), truth
 
 
 def side_views(n=8, size=32):
@@ -182,9 +180,8 @@ def test_a_correction_takes_out_what_blurred_maps_mixed_in():
     gaussians, truth = row_of_balls()
     views = side_views()
     maps = [shrink_map(rasterize(gaussians.replace(features=truth), view).map, 2) for view in views]
-    errors = [
-        wrongness(uplift_maps(gaussians, views, maps, UpliftConfig(corrections=k, keep=1.0)), truth) for k in (0, 1, 2)
-    ]
+    configs = [UpliftConfig(corrections=k, keep=1.0) for k in (0, 1, 2)]
+    errors = [wrongness(uplift_maps(gaussians, views, maps, config), truth) for config in configs]
     assert errors[0] > 0.02  # or there is nothing to correct
     assert errors[1] < 0.8 * errors[0]
     assert errors[2] < errors[1]
@@ -196,11 +193,10 @@ def test_a_correction_does_not_follow_noise(monkeypatch):
     truth = torch.eye(6)[:1].expand(24, 6)
     g = torch.Generator().manual_seed(0)
     maps = [truth[0] + 1.5 * torch.randn(32, 32, 6, generator=g) for _ in views]
-    errors = [
-        wrongness(uplift_maps(gaussians, views, maps, UpliftConfig(corrections=k, keep=1.0)), truth) for k in (0, 1)
-    ]
+    configs = [UpliftConfig(corrections=k, keep=1.0) for k in (0, 1)]
+    errors = [wrongness(uplift_maps(gaussians, views, maps, config), truth) for config in configs]
     monkeypatch.setattr(uplift, "reliability", lambda one, other, near: torch.ones(len(one)))
-    believed = wrongness(uplift_maps(gaussians, views, maps, UpliftConfig(corrections=1, keep=1.0)), truth)
+    believed = wrongness(uplift_maps(gaussians, views, maps, configs[1]), truth)
     assert errors[1] < 1.1 * errors[0]
     assert believed > 1.5 * errors[0]
 
@@ -328,15 +324,8 @@ def codebook():
     return Codebook(rows)
 
 
-def autoencoder():
-    """Written down, not fitted: latents are the first four channels, held to 0 and more."""
-    into, out = torch.eye(4, DIM), torch.eye(DIM, 4)
-    layers = ((out, torch.zeros(DIM)), (torch.eye(DIM), torch.zeros(DIM)))
-    return made_autoencoder(encoder=((into, torch.zeros(4)),), decoder=layers, low=0.0, high=1.0)
-
-
 def fuse(cloud, mode, cameras):
-    book = Codewords(codebook()) if mode == "adc" else Autoencoded(codebook(), autoencoder())
+    book = Codewords(codebook()) if mode == "adc" else Autoencoded(codebook(), first_channels(4, DIM))
     field = SemanticField(cloud, Identity(DIM) if mode == "decouple" else book)
     return fuse_views(field, cameras).fused
 
@@ -353,14 +342,14 @@ def trained(mode, n=10):
     means[-2:] += 1000
     features = codebook().unit[torch.arange(n) % 4]
     if mode == "adc+sc":
-        features = autoencoder().encode(codebook().codewords)[torch.arange(n) % 4]
+        features = first_channels(4, DIM).encode(codebook().codewords)[torch.arange(n) % 4]
     return cloud.replace(means=means, features=features + 0.1 * torch.randn(features.shape, generator=g))
 
 
 @pytest.mark.parametrize("mode", ["decouple", "adc", "adc+sc"])
 def test_answers_are_those_of_the_slow_oracle(mode):
     cloud, book = trained(mode), None if mode == "decouple" else codebook()
-    coder = autoencoder() if mode == "adc+sc" else None
+    coder = first_channels(4, DIM) if mode == "adc+sc" else None
     codewords = codebook().codewords.double().numpy()
     centres = None if coder is None else coder.encode(codebook().codewords).detach().double().numpy()
 
@@ -424,5 +413,4 @@ FOUR = random_maps(cameras())
     ],
 )
 def test_wrong_input_is_named(change, message):
-    with pytest.raises(ValueError, match=tells(*message)):
-        uplift_maps(**({"gaussians": cloud(), "cameras": cameras(), "maps": FOUR} | change))
+    refused(lambda: uplift_maps(**({"gaussians": cloud(), "cameras": cameras(), "maps": FOUR} | change)), *message)

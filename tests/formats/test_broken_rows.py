@@ -7,7 +7,7 @@ import zipfile
 import numpy as np
 import pytest
 import torch
-from cases_gltf import json_of_glb, random_cloud
+from cases_gltf import json_of_glb, ply_columns, random_cloud
 from cases_ksplat import ksplat_file, ksplat_section
 from messages import refused
 from oracles_spz import legacy_payload
@@ -138,8 +138,7 @@ def test_in_spz_ksplat_and_a_checkpoint(tmp_path):
 
 @pytest.mark.parametrize("name", ["a.ply", "a.splat", "a.pt"])
 def test_rows_of_zeros_are_left_out(tmp_path, notes, name):
-    columns = [*"xyz", *(f"f_dc_{i}" for i in range(3)), "opacity"]
-    columns += [*(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
+    columns = list(ply_columns(1))
     values = {column: np.zeros(1000, np.float32) for column in columns}
     for i, column in enumerate(columns):
         values[column][0] = i / 8 + 0.125

@@ -5,29 +5,22 @@ import json
 import numpy as np
 import pytest
 import torch
+from cases_clouds import balls
+from cases_gltf import ply_columns
 
-from kfgs import Gaussians
 from kfgs.formats import read_splats, write_splats
 from kfgs.formats.ply import read_header, write_ply
 
 C0 = 0.28209479177387814
 
 
-def _columns(n=50, higher=0, base="f_dc_"):
-    rng = np.random.default_rng(5)
-    columns = {name: rng.normal(size=n).astype("f4") for name in "xyz"}
-    columns |= {f"{base}{i}": rng.normal(size=n).astype("f4") for i in range(3)} if base else {}
-    columns |= {f"f_rest_{i}": rng.normal(size=n).astype("f4") for i in range(higher)}
-    columns["opacity"] = rng.normal(size=n).astype("f4")
-    columns |= {f"scale_{i}": (rng.normal(size=n) - 3).astype("f4") for i in range(3)}
-    return columns | {f"rot_{i}": rng.normal(size=n).astype("f4") for i in range(4)}
-
-
 @pytest.mark.parametrize(("kind", "largest"), [("u1", 255), ("u2", 65535), ("f4", 1), ("f8", 255), ("i4", 255)])
 def test_red_green_and_blue_are_colours(tmp_path, kind, largest):
     rgb = np.random.default_rng(1).random((50, 3)) * largest
     rgb = rgb if kind[0] == "f" else rgb.round()
-    columns = _columns(base="") | {name: rgb[:, i].astype(kind) for i, name in enumerate(("red", "green", "blue"))}
+    columns = ply_columns(50, base="") | {
+        name: rgb[:, i].astype(kind) for i, name in enumerate(("red", "green", "blue"))
+    }
     write_ply(tmp_path / "a.ply", columns)
     splats = read_splats(tmp_path / "a.ply")
     np.testing.assert_allclose(splats.sh[:, 0] * C0 + 0.5, rgb / largest, atol=1e-6)
@@ -37,7 +30,7 @@ def test_red_green_and_blue_are_colours(tmp_path, kind, largest):
 
 def test_where_there_are_both_harmonics_count_and_the_others_are_kept(tmp_path):
     red = np.full(50, 7, "u1")
-    columns = _columns() | {"red": red, "green": red, "blue": red}
+    columns = ply_columns(50) | {"red": red, "green": red, "blue": red}
     write_ply(tmp_path / "a.ply", columns)
     splats = read_splats(tmp_path / "a.ply")
     np.testing.assert_array_equal(splats.sh[:, 0, 1], columns["f_dc_1"])
@@ -51,7 +44,7 @@ NOTE = "spherical harmonics of degree 4: read up to degree 3"
 
 
 def test_degree_4_is_read_up_to_degree_3_and_noted(tmp_path, notes):
-    columns = _columns(higher=72)
+    columns = ply_columns(50, degree=4)
     write_ply(tmp_path / "a.ply", columns)
     splats = read_splats(tmp_path / "a.ply")
     assert notes[-1] == "a.ply: " + NOTE
@@ -80,7 +73,7 @@ def test_degree_4_is_read_up_to_degree_3_and_noted(tmp_path, notes):
 
 @pytest.mark.parametrize("coding", ["utf-8", "latin-1", "utf-8-sig"])
 def test_names_and_comments_that_are_not_ascii(tmp_path, coding):
-    write_ply(tmp_path / "a.ply", _columns() | {"größe": np.arange(50, dtype="f4")}, comments=("Büro",))
+    write_ply(tmp_path / "a.ply", ply_columns(50) | {"größe": np.arange(50, dtype="f4")}, comments=("Büro",))
     content = (tmp_path / "a.ply").read_bytes()
     for word in ("größe", "Büro"):
         content = content.replace(word.encode(), word.encode(coding.replace("-sig", "")))
@@ -94,7 +87,7 @@ def test_names_and_comments_that_are_not_ascii(tmp_path, coding):
 
 
 def test_names_that_a_ply_cannot_have_are_dropped_in_words(tmp_path):
-    write_ply(tmp_path / "a.ply", _columns() | {"mine": np.arange(50, dtype="f4")})
+    write_ply(tmp_path / "a.ply", ply_columns(50) | {"mine": np.arange(50, dtype="f4")})
     splats = read_splats(tmp_path / "a.ply")
     splats = splats.replace(extra=dict.fromkeys(("my column", "x", "ok"), splats.extra["mine"]))
     assert write_splats(splats, tmp_path / "b.ply").lost == ("the columns my column, x: .ply has no place for them",)
@@ -105,13 +98,7 @@ def test_names_that_a_ply_cannot_have_are_dropped_in_words(tmp_path):
 
 def _wide(far):
     g = torch.Generator().manual_seed(6)
-    cloud = Gaussians(
-        means=torch.randn(600, 3, generator=g),
-        quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(600, 1),
-        scales=torch.full((600, 3), 0.02),
-        opacities=torch.full((600,), 0.5),
-        sh=torch.zeros(600, 1, 3),
-    )
+    cloud = balls(torch.randn(600, 3, generator=g), scale=0.02, opacity=0.5, sh=torch.zeros(600, 1, 3))
     cloud.means[77] = far
     return cloud
 

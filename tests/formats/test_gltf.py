@@ -52,9 +52,7 @@ def test_pygltflib_reads_what_the_extension_asks_for(tmp_path):
     accessor = document.accessors[primitive.attributes.POSITION]
     np.testing.assert_allclose(accessor.min, up.min(0), rtol=1e-6)
     np.testing.assert_allclose(accessor.max, up.max(0), rtol=1e-6)
-    np.testing.assert_allclose(
-        _values(document, f"{KHR}:SCALE"), cloud.scales.numpy(), rtol=1e-6
-    )  # linear, no logarithm
+    np.testing.assert_allclose(_values(document, f"{KHR}:SCALE"), cloud.scales.numpy(), rtol=1e-6)  # linear
     np.testing.assert_allclose(_values(document, f"{KHR}:OPACITY")[:, 0], cloud.opacities.numpy(), rtol=1e-6)
     xyzw = _values(document, f"{KHR}:ROTATION")
     wxyz = cloud.quats.double().numpy()

@@ -72,10 +72,8 @@ def test_missing_file_and_columns(tmp_path):
     write_ply(tmp_path / "points.ply", {name: np.zeros(1) for name in "xyz"})
     refused(lambda: read_splats(tmp_path / "points.ply"), "points.ply:", "opacity, scale_0", "point cloud")
     (tmp_path / "points.ply").unlink()
-    with pytest.raises(ValueError, match=tells("columns:", "length", "{'x': 1, 'y': 2}")):
-        write_ply(tmp_path / "a.ply", {"x": np.zeros(1), "y": np.zeros(2)})
-    with pytest.raises(ValueError, match=tells("columns:", "got {'x': 'i8'}", "convert")):
-        write_ply(tmp_path / "a.ply", {"x": np.zeros(1, np.int64)})
+    refused(lambda: write_ply(tmp_path / "a.ply", {"x": np.zeros(1), "y": np.zeros(2)}), "columns:", "{'x': 1, 'y': 2}")
+    refused(lambda: write_ply(tmp_path / "a.ply", {"x": np.zeros(1, np.int64)}), "got {'x': 'i8'}", "convert")
     assert list(tmp_path.iterdir()) == []
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import oracles_splat as oracle
 import pytest
 import torch
-from cases_gltf import random_cloud
+from cases_gltf import ply_columns, random_cloud
 
 from kfgs import Gaussians
 from kfgs.cameras import Camera
@@ -100,9 +100,7 @@ def test_metas_of_both_spellings(meta, mode):
 
 
 def _columns(count=4):
-    g = np.random.default_rng(0)
-    names = ("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", *(f"rot_{i}" for i in range(4)))
-    return {name: g.normal(size=count).astype(np.float32) for name in names}
+    return {name: values for name, values in ply_columns(count).items() if not name.startswith("scale")}
 
 
 def test_unknown_modes_are_told(tmp_path, notes):
@@ -139,9 +137,8 @@ def test_surfels_drawn_as_flat_gaussians_are_nearly_those_of_2dgs(tilt, most):
         with_mode(Path("a"), surfel, Mode(surfels=True)).replace(features=torch.ones(1, 1)), camera, engine="reference"
     ).alpha.numpy()
     at = camera.viewmat.numpy(), camera.K.numpy().astype(float)
-    expected = [
-        [oracle.surfel_alpha(x + 0.5, y + 0.5, *values, [0.1, 0.1], 0.8, *at) for x in range(60)] for y in range(60)
-    ]
+    R = range(60)
+    expected = [[oracle.surfel_alpha(x + 0.5, y + 0.5, *values, [0.1, 0.1], 0.8, *at) for x in R] for y in R]
     assert np.abs(drawn - expected).max() < most
     assert drawn.max() > 0.7
 

@@ -71,8 +71,7 @@ def test_damage_is_named_and_costs_no_memory(tmp_path, case):
     (tmp_path / "bad.spz").write_bytes(BAD[case])
     tracemalloc.start()
     try:
-        with pytest.raises(ValueError, match="bad.spz: expected"):
-            read_splats(tmp_path / "bad.spz")
+        refused(lambda: read_splats(tmp_path / "bad.spz"), "bad.spz: expected")
         assert tracemalloc.get_traced_memory()[1] < 1 << 22
     finally:
         tracemalloc.stop()

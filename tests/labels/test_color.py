@@ -56,9 +56,7 @@ def paint(gaussians, rgb, mode="tint"):
 def test_tint_makes_the_middle_the_colour_and_keeps_ratios():
     shown = paint(greys([0.2, 0.4, 0.8]), [0.5, 0.25, 0.1])
     rgb = torch.tensor([0.5, 0.25, 0.1], dtype=torch.float64)
-    torch.testing.assert_close(
-        shown, torch.stack([0.5 * rgb, rgb, 2 * rgb])
-    )  # 0.2 / 0.4 and 0.8 / 0.4, as painted dark
+    torch.testing.assert_close(shown, torch.stack([0.5 * rgb, rgb, 2 * rgb]))  # 0.2 / 0.4 and 0.8 / 0.4
 
 
 def test_the_middle_is_of_what_covers_the_picture_and_black_becomes_flat():

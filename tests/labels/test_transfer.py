@@ -41,9 +41,7 @@ def test_tie_goes_to_the_lowest_index_in_any_order(seed):
     lowest = next(i for i in range(13) if order[i] != 12)
     assert (result.sources.tolist(), result.labels.tolist()) == ([lowest], [lowest])
     assert result.distances.tolist() == [5.0]
-    assert nearest_labels(src, torch.arange(13), torch.full((1, 3), 10.0), 5.0).labels.tolist() == [
-        -1
-    ]  # lambda is strict
+    assert nearest_labels(src, torch.arange(13), torch.full((1, 3), 10.0), 5.0).labels.tolist() == [-1]  # strict
 
 
 def test_many_sources_at_one_position_are_quick_and_the_first_labelled_one_counts():

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from cases_clouds import room
+from cases_clouds import balls, room
 from messages import refused, tells
 from scipy.spatial.transform import Rotation
 
@@ -35,8 +35,7 @@ def true_labels(points):
 
 def cloud(count, seed, **others):
     points = room(count, seed).float()
-    quats = torch.tensor([1.0, 0, 0, 0]).expand(len(points), 4)
-    return Gaussians(points, quats, torch.full((len(points), 3), 0.03), torch.full((len(points),), 0.8), **others)
+    return balls(points, scale=0.03, opacity=0.8, **others)
 
 
 def a_field(count=4_000):
@@ -139,7 +138,7 @@ def test_a_given_distance_is_lambda():
     assert 0 < attached.transfer.orphaned == int((attached.labels == -1).sum())
     labelled, none = attached.transfer.labelled, attached.transfer.orphaned
     assert attached.notes[1].endswith(
-        f"1,500 Gaussians {labelled:,} got a class by distance (lambda 0.02), {none:,} got none"
+        f"Gaussians {labelled:,} got a class by distance (lambda 0.02), {none:,} got none"
     )
 
 
@@ -171,16 +170,9 @@ def test_what_cannot_be_done_is_refused():
         attach(field, splats, CLASSES, cameras=CAMERAS, frame=strangers)
 
 
-def balls(*places):
-    n = len(places)
-    quats, scales = torch.tensor([[1.0, 0, 0, 0]] * n), torch.full((n, 3), 0.2)
-    return Gaussians(torch.tensor(places), quats, scales, torch.full((n,), 0.99))
-
-
 def test_labels_are_written_and_carried_to_points(tmp_path):
-    cloud = balls((0.0, 0, 0), (5.0, 0, 0)).replace(
-        features=torch.eye(2), labels=torch.tensor([1, 0]), scores=torch.tensor([0.5, 0.75]), names=("wall", "chair")
-    )
+    scores, names = torch.tensor([0.5, 0.75]), ("wall", "chair")
+    cloud = balls([[0.0, 0, 0], [5, 0, 0]], [1, 0], features=torch.eye(2), scores=scores, names=names)
     save_labelled(tmp_path / "a.ply", cloud, rule="by hand")
     read = read_splats(tmp_path / "a.ply")
     assert (read.labels.tolist(), read.scores.tolist(), read.names) == ([1, 0], [0.5, 0.75], ("wall", "chair"))
@@ -197,7 +189,7 @@ def test_labels_are_written_and_carried_to_points(tmp_path):
 
 
 def test_labelled_points_are_a_ply(tmp_path):
-    cloud = balls((0.0, 0, 0)).replace(labels=torch.tensor([0]), names=("wall",))
+    cloud = balls([[0.0, 0, 0]], [0], names=("wall",))
     points = {name: np.zeros(3, np.float32) for name in "xyz"}
     write_ply(tmp_path / "points.ply", points)
     refused(lambda: label_cloud(cloud, tmp_path / "points.ply", tmp_path / "points.spz"), "out:", ".ply", "points.spz")

@@ -33,7 +33,7 @@ def made(scene, folder, config, **options):
 
 def same(a, b):
     return all(
-        torch.equal(getattr(a, name), getattr(b, name)) for name in ("means", "quats", "scales", "opacities", "sh")
+        torch.equal(getattr(a, name), getattr(b, name)) for name in ["means", "quats", "scales", "opacities", "sh"]
     )
 
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from messages import tells
+from messages import refused, tells
 
 from kfgs.cameras import Camera
 from kfgs.pipeline import fit_color
@@ -22,8 +22,7 @@ def scene_with(points: torch.Tensor) -> Scene:
 
 def test_points_out_of_sight_of_all_views_are_refused():
     behind = torch.tensor([[0.0, 0, -2], [0.1, 0, -3], [50.0, 0, 1]])
-    with pytest.raises(ValueError, match=tells("scene:", "got 3 out of sight of all 1 views", "one frame?")):
-        check_scene(scene_with(behind), [0], few=1)
+    refused(lambda: check_scene(scene_with(behind), [0], few=1), "got 3 out of sight of all 1 views", "one frame?")
     check_scene(scene_with(behind), [0, 1], few=1)  # the other view shows two of them
     check_scene(scene_with(torch.cat([behind, torch.tensor([[0.0, 0, 2]])])), [0], few=1)
 

@@ -5,7 +5,7 @@ import oracles_quant as oracle
 import pytest
 import torch
 from cases_quant import made_autoencoder
-from messages import tells
+from messages import refused, tells
 
 from kfgs.quant import Autoencoder, Codebook
 
@@ -64,21 +64,15 @@ def test_save_then_load_is_the_same(tmp_path):
 
 def test_bad_input(tmp_path):
     found = example()
-    with pytest.raises(ValueError, match=tells("features:", "[..., 6]", "got (2, 3)")):
-        found.encode(torch.zeros(2, 3))
-    with pytest.raises(ValueError, match=tells("latents:", "[..., 3]", "got (2, 6)")):
-        found.decode(torch.zeros(2, 6))
-    with pytest.raises(ValueError, match=tells("decoder:", "from 3 to 6", "got (3, 5)")):
-        made_autoencoder(ENCODER, network((3, 5), 0))
-    with pytest.raises(ValueError, match=tells("range:", "low < high", "0.5")):
-        made_autoencoder(ENCODER, DECODER, 0.5, 0.5)
+    refused(lambda: found.encode(torch.zeros(2, 3)), "features:", "[..., 6]", "got (2, 3)")
+    refused(lambda: found.decode(torch.zeros(2, 6)), "latents:", "[..., 3]", "got (2, 6)")
+    refused(lambda: made_autoencoder(ENCODER, network((3, 5), 0)), "decoder:", "from 3 to 6", "got (3, 5)")
+    refused(lambda: made_autoencoder(ENCODER, DECODER, 0.5, 0.5), "range:", "low < high", "0.5")
     state = found.state_dict()
     with pytest.raises(ValueError, match=tells("tensors:", "'decoder.1.bias'")):
         Autoencoder.from_state_dict({name: value for name, value in state.items() if name != "decoder.1.bias"})
     with pytest.raises(ValueError, match=tells("tensors:", "got others")):
         Autoencoder.from_state_dict(state | {"encoder.1.weight": torch.zeros(3, 4)})
-    with pytest.raises(ValueError, match=tells("tensors:", "encoder.0.weight")):
-        Autoencoder.from_state_dict({"range": torch.tensor([0.0, 1.0])})
+    refused(lambda: Autoencoder.from_state_dict({"range": torch.tensor([0.0, 1.0])}), "tensors:", "encoder.0.weight")
     Codebook(torch.eye(3)).save(tmp_path / "book.safetensors")
-    with pytest.raises(ValueError, match=tells("book.safetensors:", "got codebook")):
-        Autoencoder.load(tmp_path / "book.safetensors")
+    refused(lambda: Autoencoder.load(tmp_path / "book.safetensors"), "book.safetensors:", "got codebook")

@@ -5,7 +5,7 @@ from pathlib import Path
 import oracles_quant as oracle
 import pytest
 import torch
-from messages import tells
+from messages import refused
 
 import kfgs
 from kfgs.quant import GrownCodebook, PaperCodebook, fit_codebook, grow, sample_grid
@@ -150,22 +150,15 @@ def test_the_table_of_concepts_has_the_fields_and_their_values():
 
 
 def test_bad_maps():
-    with pytest.raises(ValueError, match=tells("maps:", "got none")):
-        fit_codebook([])
-    with pytest.raises(ValueError, match=tells("maps:", "zero", "got 2")):
-        fit_codebook([torch.zeros(2, 3, 4)] * 2)
-    with pytest.raises(ValueError, match=tells("maps[1]:", "[n, 4]", "got (6, 5)")):
-        fit_codebook([torch.ones(2, 3, 4), torch.ones(2, 3, 5)])
-    with pytest.raises(ValueError, match=tells("maps[0]:", "[h, w, D]", "got (3, 4)")):
-        fit_codebook([torch.ones(3, 4)])
+    refused(lambda: fit_codebook([]), "maps:", "got none")
+    refused(lambda: fit_codebook([torch.zeros(2, 3, 4)] * 2), "maps:", "zero", "got 2")
+    refused(lambda: fit_codebook([torch.ones(2, 3, 4), torch.ones(2, 3, 5)]), "maps[1]:", "[n, 4]", "got (6, 5)")
+    refused(lambda: fit_codebook([torch.ones(3, 4)]), "maps[0]:", "[h, w, D]", "got (3, 4)")
     broken = torch.ones(2, 3, 4)
     broken[1, 2, 3] = float("nan")
-    with pytest.raises(ValueError, match=tells("maps[1]:", "got NaN")):
-        fit_codebook([torch.ones(2, 3, 4), broken])
-    with pytest.raises(ValueError, match=tells("maps[0]:", "squares", "float32", "got 1e+37", "divide")):
-        fit_codebook([torch.full((2, 3, 4), 1e37)])
-    with pytest.raises(ValueError, match=tells("maps:", "longer than 1e-08", "got 2 maps")):
-        fit_codebook([torch.full((2, 3, 4), 1e-37)] * 2)
+    refused(lambda: fit_codebook([torch.ones(2, 3, 4), broken]), "maps[1]:", "got NaN")
+    refused(lambda: fit_codebook([torch.full((2, 3, 4), 1e37)]), "maps[0]:", "squares", "got 1e+37", "divide")
+    refused(lambda: fit_codebook([torch.full((2, 3, 4), 1e-37)] * 2), "maps:", "longer than 1e-08", "got 2 maps")
 
 
 @pytest.mark.parametrize(
@@ -180,8 +173,7 @@ def test_bad_maps():
     ],
 )
 def test_bad_config(values, message):
-    with pytest.raises(ValueError, match=tells(*message)):
-        PaperCodebook(**values)
+    refused(lambda: PaperCodebook(**values), *message)
 
 
 def test_no_image_fills_the_codebook_alone():
@@ -189,7 +181,7 @@ def test_no_image_fills_the_codebook_alone():
     maps = [torch.randn(8, 8, 32, generator=generator) for _ in range(4)]  # nothing is similar to anything
     seen: list[int] = []
     fit = fit_codebook(
-        maps, PaperCodebook(initial=2, maximum=10, epochs=1), progress=lambda row: seen.append(row["added"])
+        maps, PaperCodebook(initial=2, maximum=10, epochs=1), progress=lambda one: seen.append(one["added"])
     )
     assert seen == [8]  # two of each image
     index = [int((fit.unit @ m.reshape(-1, 32).T / m.reshape(-1, 32).norm(dim=1)).amax() > 0.99) for m in maps]

@@ -3,7 +3,7 @@
 import pytest
 import torch
 from cases_clouds import room, surface
-from messages import tells
+from messages import refused
 
 from kfgs.cameras.similarity import Similarity
 from kfgs.scenes.frames import frames_agree
@@ -92,9 +92,6 @@ def test_nan_and_single_points_are_refused():
     good = surface(200, 0)
     bad = good.clone()
     bad[7, 1] = torch.nan
-    with pytest.raises(ValueError, match=tells("dst:", "got NaN", "row 7")):
-        frames_agree(good, bad)
-    with pytest.raises(ValueError, match=tells("src:", "got 1")):
-        frames_agree(good[:1], good)
-    with pytest.raises(ValueError, match=tells("dst:", "[M, 3]", "got (200, 2)")):
-        frames_agree(good, good[:, :2])
+    refused(lambda: frames_agree(good, bad), "dst:", "got NaN", "row 7")
+    refused(lambda: frames_agree(good[:1], good), "src:", "got 1")
+    refused(lambda: frames_agree(good, good[:, :2]), "dst:", "[M, 3]", "got (200, 2)")

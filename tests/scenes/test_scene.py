@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 from colmap_models import write_picture
-from messages import tells
+from messages import refused, tells
 
 from kfgs.cameras import Camera, Distortion
 from kfgs.cameras.resample import undistort
@@ -32,8 +32,7 @@ def _scene(tmp_path: Path, distortion: Distortion | None = None, positions: tupl
 def test_a_picture_of_another_size_is_an_error(tmp_path: Path) -> None:
     scene = _scene(tmp_path)
     write_picture(scene.image_paths[1], 24, 32)
-    with pytest.raises(SceneError, match=tells("rgb_5.png:", "64x48", "got 32x24")):
-        scene.image(1)
+    refused(lambda: scene.image(1), "rgb_5.png:", "64x48", "got 32x24", error=SceneError)
 
 
 def test_undistorted_scenes_undistort_lazily(tmp_path: Path) -> None:
@@ -104,12 +103,9 @@ def test_select_by_split_name_stem_and_index(tmp_path: Path) -> None:
 
 def test_scenes_are_checked(tmp_path: Path) -> None:
     scene = _scene(tmp_path)
-    with pytest.raises(ValueError, match=tells("image_paths:", "expected 3", "got 1")):
-        replace(scene, image_paths=scene.image_paths[:1])
-    with pytest.raises(ValueError, match=tells("colors:", "[P, 3]", "P = 2", "got (3, 3)")):
-        replace(scene, colors=torch.zeros(3, 3, dtype=torch.uint8))
-    with pytest.raises(ValueError, match=tells("splits['train']:", "[0, 3)", "got 9")):
-        replace(scene, splits={"train": [0, 9]})
+    refused(lambda: replace(scene, image_paths=scene.image_paths[:1]), "image_paths:", "expected 3", "got 1")
+    refused(lambda: replace(scene, colors=torch.zeros(3, 3, dtype=torch.uint8)), "colors:", "[P, 3]", "got (3, 3)")
+    refused(lambda: replace(scene, splits={"train": [0, 9]}), "splits['train']:", "[0, 3)", "got 9")
     with pytest.raises(SceneError, match=tells("cameras:", "suffix", "got 'a' twice")):
         replace(scene, cameras=[_camera("a.png"), _camera("a.jpg"), _camera("b.png")])
     assert repr(scene) == "Scene(3 views, 2 points, splits: train 2, test 1)"
@@ -128,5 +124,4 @@ def test_all_are_all_views_unless_a_split_has_that_name(tmp_path: Path) -> None:
     scene = replace(_scene(tmp_path), splits={"train": [1], "test": [], "night": [0]})
     assert scene.views("all") == list(range(len(scene)))
     assert replace(scene, splits={"all": [1]}).views("all") == [1]
-    with pytest.raises(ValueError, match="split: expected one of train, night, all, got 'test'"):
-        scene.views("test")
+    refused(lambda: scene.views("test"), "split: expected one of train, night, all, got 'test'")

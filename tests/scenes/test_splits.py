@@ -2,7 +2,7 @@ import json
 from pathlib import Path
 
 import pytest
-from messages import tells
+from messages import refused
 
 from kfgs.scenes import SceneError
 from kfgs.scenes.files import natural_key
@@ -54,8 +54,7 @@ def test_a_split_file_lists_stems(tmp_path: Path) -> None:
     ],
 )
 def test_wrong_split_files_are_refused(tmp_path: Path, value: object, message: str) -> None:
-    with pytest.raises(SceneError, match=tells(*message)):
-        read_split(_write(tmp_path / "split.json", value).parent, ["a", "b"])
+    refused(lambda: read_split(_write(tmp_path / "split.json", value).parent, ["a", "b"]), *message, error=SceneError)
 
 
 @pytest.mark.parametrize(
@@ -90,8 +89,6 @@ def test_unknown_names_of_a_list_are_told_and_lists_without_a_view_refused(tmp_p
     assert notes[0].endswith("test.txt are not in the scene: frame_b.png (did you mean 'b.png'?)")
     for text in ("frame_1.png", "a.png\nb.png"):
         (tmp_path / "test.txt").write_text(text)
-        with pytest.raises(SceneError, match=tells("test.txt", "2 pictures", text[:5], "correct the names")):
-            read_split(tmp_path, names)
+        refused(lambda: read_split(tmp_path, names), "test.txt", text[:5], "correct the names", error=SceneError)
     (tmp_path / "test.txt").write_bytes(b"K\xfcche.png")
-    with pytest.raises(SceneError, match="save it as UTF-8"):
-        read_split(tmp_path, names)
+    refused(lambda: read_split(tmp_path, names), "save it as UTF-8", error=SceneError)

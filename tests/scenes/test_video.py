@@ -7,7 +7,7 @@ import imageio_ffmpeg
 import numpy as np
 import pytest
 from cases_sfm import downsized
-from messages import tells
+from messages import refused, tells
 from PIL import Image, ImageFilter
 
 from kfgs.cli import main
@@ -71,10 +71,7 @@ def test_sharpness_is_the_variance_of_the_laplacian() -> None:
     grey = g.integers(0, 255, (9, 11), dtype=np.uint8)
     frame = np.repeat(grey[..., None], 3, 2)
     padded = np.pad(grey.astype(np.float64), 1, mode="reflect")
-    values = np.zeros(grey.shape)
-    for y in range(9):
-        for x in range(11):
-            values[y, x] = padded[y : y + 3, x : x + 3].sum() - 9 * padded[y + 1, x + 1]
+    values = np.lib.stride_tricks.sliding_window_view(padded, (3, 3)).sum((2, 3)) - 9.0 * grey
     assert sharpness(frame) == pytest.approx(values.var(ddof=1), rel=1e-4)
     assert sharpness(np.full((9, 11, 3), 7, np.uint8)) == 0
 
@@ -83,8 +80,7 @@ def test_frames_that_are_there_are_kept_and_others_are_not_mixed(video: Path, tm
     first = extract_frames(video, tmp_path / "images", fps=1)
     times = [file.stat().st_mtime_ns for file in first]
     assert [file.stat().st_mtime_ns for file in extract_frames(video, tmp_path / "images", fps=1)] == times
-    with pytest.raises(FileExistsError, match=tells("images", "new or empty", "--out")):
-        extract_frames(video, tmp_path / "images", fps=2)
+    refused(lambda: extract_frames(video, tmp_path / "images", fps=2), "images", "--out", error=FileExistsError)
     assert (tmp_path / "images" / SOURCE).is_file()
 
 
@@ -94,14 +90,12 @@ def test_what_is_no_video(tmp_path: Path, video: Path, monkeypatch: pytest.Monke
     (tmp_path / "bad.mp4").write_bytes(b"not a video" * 100)
     with pytest.raises(SceneError, match=tells("bad.mp4", "ffmpeg can decode", "H.264")):
         extract_frames(tmp_path / "bad.mp4", tmp_path / "out")
-    with pytest.raises(ValueError, match=tells("fps")):
-        extract_frames(video, tmp_path / "out", fps=0)
+    refused(lambda: extract_frames(video, tmp_path / "out", fps=0), "fps")
     # a playlist that is named .mp4: ffmpeg must not open what it names
     (tmp_path / "list.mp4").write_text(
         "#EXTM3U\n#EXT-X-TARGETDURATION:1\n#EXTINF:1,\nhttp://127.0.0.1:9/a.ts\n#EXT-X-ENDLIST\n"
     )
-    with pytest.raises(SceneError, match=tells("list.mp4")):
-        extract_frames(tmp_path / "list.mp4", tmp_path / "out")
+    refused(lambda: extract_frames(tmp_path / "list.mp4", tmp_path / "out"), "list.mp4", error=SceneError)
     assert not (tmp_path / "out").exists()
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     with pytest.raises(ImportError, match=tells("imageio-ffmpeg", "pip install imageio-ffmpeg")):

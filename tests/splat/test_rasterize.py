@@ -12,25 +12,6 @@ from kfgs.splat import rasterize, rasterize_labels
 from kfgs.splat.sh import SH_C0
 
 
-def test_agrees_with_the_equations_from_3d_to_the_map():
-    camera = a_camera()
-    gaussians = gaussians_before(camera, 40, seed=1, spread=1.5)
-    background = torch.tensor([0.5, -1.0, 2.0]).double()
-    rendering = rasterize(gaussians, camera, background=background, engine="reference")
-    values = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.features)
-    maps, alphas = oracle.render(
-        *(v.numpy() for v in values),
-        camera.viewmat.numpy(),
-        camera.K.numpy(),
-        camera.width,
-        camera.height,
-        background=background.numpy(),
-    )
-    torch.testing.assert_close(rendering.map, torch.from_numpy(maps), rtol=0, atol=TOLERANCE[torch.float64])
-    torch.testing.assert_close(rendering.alpha, torch.from_numpy(alphas), rtol=0, atol=TOLERANCE[torch.float64])
-    assert alphas.max() > 0.8
-
-
 @pytest.mark.parametrize("engine", ["reference", "auto"])
 def test_antialiased_agrees_with_the_equations(engine):
     camera = a_camera()
@@ -47,26 +28,6 @@ def test_antialiased_agrees_with_the_equations(engine):
     labels = rasterize_labels(gaussians, camera, engine=engine)
     seen = labels.labels[..., 0] >= 0
     torch.testing.assert_close(labels.scores[seen][:, 0], torch.from_numpy(maps).amax(2)[seen], rtol=0, atol=1e-10)
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_auto_engine_agrees_with_the_reference(dtype):
-    camera = a_camera(40, 30, focal=(35.0, 38.0), principal=(18.3, 16.1), dtype=dtype)
-    gaussians = gaussians_before(camera, 100, seed=2)
-    ours, reference = rasterize(gaussians, camera), rasterize(gaussians, camera, engine="reference")
-    torch.testing.assert_close(ours.map, reference.map, rtol=0, atol=10 * TOLERANCE[dtype])  # values up to 4
-    assert ours.map.dtype == dtype
-
-
-def test_gaussians_behind_the_camera_do_not_show():
-    camera = a_camera()
-    gaussians = gaussians_before(camera, 20, seed=8)
-    behind = gaussians.replace(means=2 * camera.center - gaussians.means)  # projects to the same pixels
-    background = torch.tensor([1.0, 2.0, 3.0]).double()
-    rendering = rasterize(behind, camera, background=background)
-    assert len(rendering.projected.index) == 0
-    assert torch.equal(rendering.map, background.expand(18, 24, 3))
-    assert (rendering.alpha == 0).all()
 
 
 def test_colour_is_seen_from_the_camera():
@@ -129,9 +90,8 @@ def test_gradients_of_colour_reach_harmonics_and_means():
     def render(means, sh):
         return rasterize(gaussians.replace(means=means, sh=sh), camera).map
 
-    assert torch.autograd.gradcheck(
-        render, (gaussians.means.clone().requires_grad_(), sh.requires_grad_()), fast_mode=True
-    )
+    inputs = gaussians.means.clone().requires_grad_(), sh.requires_grad_()
+    assert torch.autograd.gradcheck(render, inputs, fast_mode=True)
 
 
 def test_something_to_render_is_needed():
@@ -150,7 +110,5 @@ def test_arguments_of_another_kind_and_mixed_types_are_named():
     assert torch.equal(torch.from_numpy(rendering.to_numpy()), rendering.map.detach())
     for name in ("quats", "scales", "opacities", "features"):
         mixed = gaussians.replace(**{name: getattr(gaussians, name).float()})
-        with pytest.raises(
-            ValueError, match=tells(f"gaussians.{name}", "float64", "got torch.float32", "gaussians.to(")
-        ):
+        with pytest.raises(ValueError, match=tells(f"gaussians.{name}", "float64", "torch.float32", "gaussians.to(")):
             rasterize(mixed, camera)

@@ -32,18 +32,6 @@ def test_harmonics_agree_with_legendre_functions(degree):
         np.testing.assert_allclose(ours.numpy(), expected, atol=1e-13)
 
 
-def test_band_one_is_minus_y_z_minus_x():
-    C1 = 0.4886025119029199
-    axes = torch.eye(3, dtype=torch.float64)
-    table = torch.stack([_response(k, axes, 4) for k in (1, 2, 3)])  # coefficients by axes x, y, z
-    torch.testing.assert_close(table, C1 * torch.tensor([[0, -1, 0], [0, 0, 1], [-1, 0, 0]]).double())
-
-
-def test_length_of_the_direction_does_not_matter():
-    sh = torch.randn(50, 16, 3, generator=torch.Generator().manual_seed(1)).double()
-    torch.testing.assert_close(evaluate_sh(sh, _directions()), evaluate_sh(sh, 7.5 * _directions()))
-
-
 def test_negative_colour_is_clamped_and_has_no_gradient():
     sh = torch.tensor([[[-5.0, 0.0, 5.0]]], requires_grad=True)
     rgb = evaluate_sh(sh, torch.tensor([[0.0, 0.0, 1.0]]))
@@ -56,11 +44,6 @@ def test_rgb_survives_the_round_trip():
     rgb = torch.rand(7, 3, generator=torch.Generator().manual_seed(2))
     torch.testing.assert_close(sh0_to_rgb(rgb_to_sh0(rgb)), rgb)
     torch.testing.assert_close(evaluate_sh(rgb_to_sh0(rgb)[:, None], _directions(7).float()), rgb)
-
-
-def test_gradients():
-    sh = 0.1 * torch.randn(5, 16, 3, generator=torch.Generator().manual_seed(3)).double()
-    assert torch.autograd.gradcheck(evaluate_sh, (sh.requires_grad_(), _directions(5).requires_grad_()))
 
 
 def test_number_of_coefficients_must_be_a_full_degree():

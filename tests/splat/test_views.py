@@ -1,9 +1,11 @@
+from functools import partial
+
 import pytest
 import torch
+from cases_clouds import balls
 from messages import refused, tells
 
 from kfgs.cameras import Camera
-from kfgs.gaussians import Gaussians
 from kfgs.splat import average_views, vote_labels
 
 
@@ -16,11 +18,7 @@ def _camera(width=32, height=24, focal=30.0, name=""):
     return Camera(torch.eye(4), K, width, height, name)
 
 
-def cloud(means, opacity=0.9, scale=0.1):
-    means = torch.tensor(means)
-    n = len(means)
-    quats = torch.tensor([[1.0, 0, 0, 0]]).expand(n, 4)
-    return Gaussians(means, quats, torch.full((n, 3), scale), torch.full((n,), opacity))
+cloud = partial(balls, scale=0.1)
 
 
 def test_a_constant_signal_is_its_own_average_and_the_unseen_get_none():

@@ -4,6 +4,7 @@ import numpy as np
 import pycolmap
 import pytest
 import torch
+from messages import refused
 from PIL import Image
 
 import kfgs
@@ -70,6 +71,5 @@ def test_undistorted_views_are_pinholes(scene):
 def test_a_distorted_view_is_not_drawn_silently(scene):
     means, quats = torch.tensor([[0.0, 0, 2]]), torch.tensor([[1.0, 0, 0, 0]])
     cloud = kfgs.Gaussians(means, quats, torch.full((1, 3), 0.1), torch.ones(1) / 2, features=torch.ones(1, 1))
-    with pytest.raises(ValueError, match="undistort"):
-        kfgs.rasterize(cloud, scene[0].cameras[0])
+    refused(lambda: kfgs.rasterize(cloud, scene[0].cameras[0]), "undistort")
     assert kfgs.rasterize(cloud, scene[0].undistorted().cameras[0]).map.max() > 0.3

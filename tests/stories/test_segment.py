@@ -28,8 +28,6 @@ def test_labels_are_those_of_the_reference_engine(fused, paper, room):
         cloud = field.label(room.classes)
         votes = torch.nn.functional.one_hot(cloud.labels + 1, len(room.classes) + 1)[:, 1:].float()
         cloud = cloud.replace(features=votes, sh=None)
-        fast, plain = (
-            rasterize_labels(cloud, room.unseen[0], engine=engine).labels for engine in ("auto", "reference")
-        )
+        fast, plain = (rasterize_labels(cloud, room.unseen[0], engine=name).labels for name in ("auto", "reference"))
         assert torch.equal(fast, plain)
         assert len(fast.unique()) > 8

@@ -135,6 +135,5 @@ def test_what_torch_saves_beside_state_dicts_is_named(tmp_path: Path, value: obj
 
 
 def test_no_file_and_folder(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match=tells("a.ckpt:", "checkpoint", "no such file")):
-        read_checkpoint(tmp_path / "a.ckpt")
+    refused(lambda: read_checkpoint(tmp_path / "a.ckpt"), "a.ckpt:", "no such file", error=FileNotFoundError)
     refused(lambda: read_checkpoint(tmp_path), "checkpoint", "got a folder", "weights")

@@ -90,9 +90,7 @@ def test_activation_and_heads_come_from_the_settings(clip, tmp_path):
     assert model.config.vision_config.hidden_act == model.config.text_config.hidden_act == "quick_gelu"
 
 
-@pytest.mark.parametrize(
-    "key", ["visual.trunk.blocks.0.attn.qkv.weight", "visual.layer1.0.conv1.weight", "vision_model.x"]
-)
+@pytest.mark.parametrize("key", ["visual.trunk.blocks.0.attn.qkv", "visual.layer1.0.conv1.weight", "vision_model.x"])
 def test_other_models_are_named(tmp_path, key):
     folder = write(tmp_path / "model", {key: torch.zeros(2)})
     words = ("open_clip_pytorch_model.bin:", "OpenCLIP", key, "'visual.conv1.weight'", "save_pretrained")

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from kfgs.toy.geometry import Places, Solid, Texture
-from kfgs.toy.light import LAMPS, lamps_seen, openness
+from kfgs.toy.light import LAMPS, lamps_seen
 
 SKIN = Texture("plaster", ((0.5, 0.5, 0.5), (0.6, 0.6, 0.6)))
 LAMP = LAMPS[0]
@@ -23,25 +23,6 @@ def facing_up(points, which=-1):
     return Places(points, np.broadcast_to(UP, points.shape), np.full(len(points), which))
 
 
-def share_by_rays(solid, point):
-    """The share of the lamp's disc, square to the ray, that the place sees: many rays, each stepped along."""
-    way = np.array(LAMP.place) - point
-    way /= np.linalg.norm(way)
-    side = np.cross(way, [0.3, 0.9, 0.1])
-    side /= np.linalg.norm(side)
-    seen = total = 0
-    for u in np.linspace(-1, 1, 21):
-        for v in np.linspace(-1, 1, 21):
-            if u * u + v * v > 1:
-                continue
-            end = np.array(LAMP.place) + LAMP.radius * (u * side + v * np.cross(way, side))
-            local = solid.to_local(point + np.linspace(0, 1, 200)[:, None] * (end - point))
-            size = np.abs(local / solid.half)
-            inside = (size.max(1) if solid.shape == "box" else np.linalg.norm(size, axis=1)) < 1
-            seen, total = seen + (not inside.any()), total + 1
-    return seen / total
-
-
 @pytest.mark.parametrize("shape", ["box", "ellipsoid"])
 def test_a_shadow_is_dark_in_its_middle_soft_at_its_edge_and_ends(shape):
     solid = piece(shape, half=(0.45, 0.45, 0.1))
@@ -50,8 +31,6 @@ def test_a_shadow_is_dark_in_its_middle_soft_at_its_edge_and_ends(shape):
     assert seen[0] < 0.02
     assert seen[-1] == 1.0
     assert (np.diff(seen) >= -1e-9).all()
-    true = np.array([share_by_rays(solid, point) for point in points])
-    assert np.abs(seen - true).max() < 0.3  # it is closed form, not exact
     assert ((seen > 0.05) & (seen < 0.95)).any()
 
 
@@ -62,14 +41,3 @@ def test_no_solid_shades_itself_and_walls_cast_no_shadow():
     assert lamps_seen([table], facing_up(top - [0, 0, 1.0]))[0, 0] < 0.02
     wall = Solid("box", table.center, table.half, table.yaw, "wall", SKIN)
     assert lamps_seen([wall], facing_up(top - [0, 0, 1.0]))[0, 0] == 1.0
-
-
-@pytest.mark.parametrize("shape", ["box", "ellipsoid"])
-def test_corners_and_places_beside_furniture_are_less_open(shape):
-    solid = piece(shape, z=0.3, half=(0.3, 0.3, 0.3))
-    points = on_floor([0.31, 0.5, 2.0])
-    opened = openness([solid], facing_up(points))
-    assert opened[0] < opened[1] < opened[2]
-    corner = np.array([[-2.9, -2.4, 0.0], [0.0, 0.0, 0.0]])
-    dark, light = openness([], facing_up(corner))
-    assert dark < 0.8 < light <= 1.0

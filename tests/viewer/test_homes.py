@@ -94,9 +94,8 @@ def test_one_person_everywhere(browser, tmp_path, home):
         state.set_distance(0.35)
         agree(page, state)
         none = int((state.labels("color") < 0).sum())
-        assert (
-            page.locator("#lambda-said").inner_text().startswith(f"{none} of 450 Gaussians are farther than 0.35 from")
-        )
+        said = page.locator("#lambda-said").inner_text()
+        assert said.startswith(f"{none} of 450 Gaussians are farther than 0.35 from")
         x, y, width, height = page.locator(".stage").bounding_box().values()
         page.mouse.click(x + width / 2, y + height / 2)  # pick: perhaps nothing is there
         page.evaluate("viewer.model.pick('color', 200)")

@@ -8,8 +8,6 @@ from messages import refused
 
 from kfgs.formats import read_splats
 from kfgs.labels import EditList, Selection, connected_parts
-from kfgs.splat.sh import rgb_to_sh0
-from kfgs.viewer import Exploration, FieldMeaning
 from kfgs.viewer.session import Session
 
 
@@ -24,13 +22,7 @@ def bits_of(mask):
 
 @pytest.fixture
 def session(tmp_path):
-    meaning = FieldMeaning(cases_explorer.field("fused"), cases_explorer.classes())
-    color = cases_explorer.cloud(
-        torch.rand(60, 3, generator=torch.Generator().manual_seed(2)) * 2 + torch.tensor([-1, -1, 4])
-    )
-    color = color.replace(sh=rgb_to_sh0(torch.rand(60, 3))[:, None])
-    state = Exploration(meaning, color, cameras=cases_explorer.cameras(), distance=0.4)
-    return Session(state, tmp_path / "out")
+    return Session(cases_explorer.room(), tmp_path / "out")
 
 
 def test_an_answer_is_that_of_the_state(session):
@@ -80,9 +72,7 @@ def test_copies_are_saved_and_split_as_they_are_in_the_viewer(session):
     cloud = session.state.cloud("color")
     torch.testing.assert_close(made.means, cloud.means[copied] + torch.tensor([100.0, 0, 0]))
     torch.testing.assert_close(made.opacities, cloud.opacities[copied] * torch.tensor([0.5, 0.5, 1, 1]))
-    answer, attached = session.call(
-        "parts", {"side": "color", "edits": edits}, bits_of(torch.ones(64, dtype=torch.bool))
-    )
+    answer, attached = session.call("parts", {"side": "color", "edits": edits}, bits_of(torch.ones(64).bool()))
     numbers = np.frombuffer(attached, "<i2")
     assert len(numbers) == 64
     assert not set(numbers[:60]) & set(numbers[60:]) - {-1}

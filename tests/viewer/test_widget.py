@@ -14,16 +14,7 @@ from PIL import Image
 pytest.importorskip("anywidget")
 
 from kfgs.splat import rasterize
-from kfgs.splat.sh import rgb_to_sh0
-from kfgs.viewer import Exploration, FieldMeaning, Viewer, explore, pack
-
-
-def exploration():
-    generator = torch.Generator().manual_seed(2)
-    means = torch.rand(60, 3, generator=generator) * 2 + torch.tensor([-1, -1, 4])
-    color = cases_explorer.cloud(means, sh=rgb_to_sh0(torch.rand(60, 3, generator=generator))[:, None])
-    meaning = FieldMeaning(cases_explorer.field("fused"), cases_explorer.classes())
-    return Exploration(meaning, color, cameras=cases_explorer.cameras(), distance=0.4)
+from kfgs.viewer import Viewer, explore, pack
 
 
 def still_of(state):
@@ -33,7 +24,7 @@ def still_of(state):
 
 
 def test_the_scene_is_sent_once(tmp_path):
-    state = exploration()
+    state = cases_explorer.room()
     state.ask("chair")
     widget = Viewer(state, title="room", out=tmp_path).widget
     packed = pack.pack_scene(state, title="room")
@@ -44,7 +35,7 @@ def test_the_scene_is_sent_once(tmp_path):
 
 
 def test_explore_in_a_notebook_gives_a_viewer(monkeypatch):
-    state = exploration()
+    state = cases_explorer.room()
     viewer = explore(
         cases_explorer.field("fused"), state.cloud("color"), classes=cases_explorer.classes(), where="notebook"
     )
@@ -62,7 +53,7 @@ def test_explore_in_a_notebook_gives_a_viewer(monkeypatch):
 
 @pytest.mark.parametrize("show", ["rgb", "labels"])
 def test_a_picture_stands_in_where_widgets_cannot_run(show):
-    state = exploration()
+    state = cases_explorer.room()
     state.set_show(show)
     picture = still_of(state)
     assert picture.shape[:2] == (state.cameras[0].height, state.cameras[0].width)

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import torch
+from cases_clouds import balls
 from PIL import Image
 
 from kfgs.cameras import Camera
@@ -15,12 +16,8 @@ from kfgs.viz.films import WIDTH, write_parts
 
 
 def ball(*places, color=(1.0, 0.0, 0.0), scale=0.3):
-    n = len(places)
-    sh = ((torch.tensor(color) - 0.5) / 0.28209479177387814).expand(n, 1, 3).clone()
-    means = torch.tensor(places, dtype=torch.float32)
-    return Gaussians(
-        means, torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1), torch.full((n, 3), scale), torch.ones(n), sh=sh
-    )
+    sh = ((torch.tensor(color) - 0.5) / 0.28209479177387814).expand(len(places), 1, 3).clone()
+    return balls(places, scale=scale, opacity=1.0, sh=sh)
 
 
 def camera(degrees, name="a.png", size=(48, 64)):

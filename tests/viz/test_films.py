@@ -67,9 +67,7 @@ def frames_of(path):
 
 def test_a_gif_holds_the_frames_their_time_and_repeats(tmp_path):
     done = []
-    path = save_animation(
-        tmp_path / "new" / "a.gif", shade, cameras(4), fps=12, progress=lambda *counts: done.append(counts)
-    )
+    path = save_animation(tmp_path / "new" / "a.gif", shade, cameras(4), fps=12, progress=lambda *n: done.append(n))
     frames, info = frames_of(path)
     assert [int(frame[0, 0, 0]) for frame in frames] == [0, 40, 80, 120]
     assert all((frame == frame[0, 0]).all() and frame.shape == (8, 12, 3) for frame in frames)

@@ -123,9 +123,8 @@ def test_a_full_disk_costs_the_cache_alone(run, tmp_path):
 def test_a_damaged_cache_is_made_again(run, tmp_path):
     for dtype in ("float32", "float64"):
         run(dtype)
-    index, first, second = sorted(
-        (tmp_path / "cache").rglob("*.nb?"), key=lambda file: (file.suffix != ".nbi", file.name)
-    )
+    files = (tmp_path / "cache").rglob("*.nb?")
+    index, first, second = sorted(files, key=lambda file: (file.suffix != ".nbi", file.name))
     whole, kernel, other = (file.read_bytes() for file in (index, first, second))
     assert whole != kernel != other
     for file, damaged in (

@@ -138,9 +138,8 @@ def test_rising_index_is_that_of_the_selected_rows(channels, many_bands):
 @pytest.mark.parametrize("channels", [3, 20, 40])
 @pytest.mark.parametrize("count", [CHUNK - 1, CHUNK, CHUNK + 1, 3 * CHUNK + 5])
 def test_lists_longer_than_a_chunk(count, channels):
-    projected, features = random_splats(
-        count, 13, 11, seed=count, opacities=(0.01, 0.03), sigma=(2.0, 9.0), channels=channels
-    )
+    faint = {"opacities": (0.01, 0.03), "sigma": (2.0, 9.0)}
+    projected, features = random_splats(count, 13, 11, seed=count, channels=channels, **faint)
     tiles = _everywhere(count, 13, 11, 16)
     ours = _gradients(projected, features, 13, 11, tiles)
     reference = _gradients(projected, features, 13, 11, tiles, engine="reference")

@@ -137,15 +137,14 @@ def test_threads_and_shares_and_order_do_not_matter(dtype, monkeypatch):
     camera = a_camera(dtype=dtype)
     gaussians = gaussians_before(camera, 1000, seed=5, spread=1.5)
     before, threads = _run(gaussians, camera, "numba"), torch.get_num_threads()
+    expected = *before[0], *before[1]
     try:
         for share in (37, 100, 512, 16384):
             monkeypatch.setattr(numba_project, "_SHARE", share)
             for count in (1, 2, 5):
                 torch.set_num_threads(count)
                 after = _run(gaussians, camera, "numba")
-                assert all(
-                    torch.equal(a, b) for a, b in zip([*after[0], *after[1]], [*before[0], *before[1]], strict=True)
-                )
+                assert all(torch.equal(a, b) for a, b in zip((*after[0], *after[1]), expected, strict=True))
     finally:
         torch.set_num_threads(threads)
     order = torch.randperm(1000, generator=torch.Generator().manual_seed(0))

@@ -57,7 +57,7 @@ def test_missing_unknown_and_misshapen_tensors_are_counted_and_named(state):
         network_from_state(state, TINY, source="my.ckpt")
     message = str(caught.value)
     assert (
-        "2 missing (pretrained.model.blocks.2.attn.qkv.weight (96, 32); scratch.head1.weight (16, 12, 1, 1))" in message
+        "2 missing (pretrained.model.blocks.2.attn.qkv.weight (96, 32); scratch.head1.weight (16, 12, 1, 1" in message
     )
     assert "1 unknown (scratch.extra)" in message
     assert "1 of another shape or type (pretrained.model.pos_embed: expected (1, 10, 32), got (1, 17, 32)" in message

@@ -68,9 +68,7 @@ def assert_close(found, expected):
 @pytest.mark.parametrize(
     ("size", "map_size"), [((150, 113), (64, 48)), ((9, 120), (5, 64)), ((41, 29), (41, 29)), ((1, 1), (1, 1))]
 )
-def test_features_at_four_scales_with_flips_and_fast_ones_are_those_of_transformers(
-    state, checkpoint, size, map_size, fast
-):
+def test_features_at_four_scales_with_flips_and_fast_are_those_of_transformers(state, checkpoint, size, map_size, fast):
     image = picture(*size)
     found = load_lseg(checkpoint, config=DEEP, fast=fast).encode_image(torch.from_numpy(image))
     assert tuple(found.shape) == (16, *map_size)
