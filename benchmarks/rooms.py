@@ -88,9 +88,7 @@ def mend(folder: Path, removed: Sequence[str] = ()) -> ET.Element:
         e.set("id", f"{e.get('type')}{number}" if mesh is None else Path(mesh.get("value", "")).stem)
         if e.get("id") in removed or (mesh is not None and not (folder / mesh.get("value", "")).exists()):
             root.remove(e)
-    for e in [e for e in root if e.tag in ("default", "integrator", "sensor")]:
-        root.remove(e)
-    for e in root.iter():
+    for e in list(root.iter()):
         value = e.get("value", "")
         if e.get("name") == "filename":
             e.set("value", str((folder / value).resolve()))
@@ -99,12 +97,13 @@ def mend(folder: Path, removed: Sequence[str] = ()) -> ET.Element:
         if e.tag in ("rgb", "srgb") and value.startswith("#"):
             e.tag = "rgb"
             e.set("value", ", ".join(str((int(value[i : i + 2], 16) / 255) ** 2.2) for i in (1, 3, 5)))
-        old = {"extEta", "sunRadiusScale"}
-        if e.get("type") == "roughdiffuse":
+        rough = e.get("type") == "roughdiffuse"
+        if rough:
             e.set("type", "diffuse")
-            old |= {"alpha", "useFastApprox"}
-        for child in [child for child in e if child.get("name") in old]:
-            e.remove(child)
+        old = {"extEta", "sunRadiusScale"} | ({"alpha", "useFastApprox"} if rough else set())
+        for child in list(e):
+            if child.tag in ("default", "integrator", "sensor") or child.get("name") in old:
+                e.remove(child)
     return root
 
 
@@ -112,24 +111,23 @@ class Room:
     """A scene in Mitsuba, asked in metres with z up."""
 
     def __init__(self, folder: Path, metres_per_unit: float, removed: Sequence[str] = ()) -> None:
-        import drjit as dr
+        import drjit
         import mitsuba as mi
 
+        self.mi, self.reinterpret = mi, drjit.reinterpret_array
         text = ET.tostring(mend(folder, removed), encoding="unicode")
         self.scene, self.unit = mi.load_string(text, optimize=False), metres_per_unit  # optimize would join shapes
         self.shapes = [shape.id() for shape in self.scene.shapes()]
         self.tops = np.array([0.9 * s.bbox().max.y + 0.1 * s.bbox().min.y for s in self.scene.shapes()])
         self.to_scene = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # z up to y up
-        registered = np.array(dr.reinterpret_array(mi.UInt32, self.scene.shapes_dr()))  # as threads loaded them
+        registered = np.array(self.reinterpret(mi.UInt32, self.scene.shapes_dr()))  # as threads loaded them
         self.place = np.full(int(registered.max()) + 1, -1)
         self.place[registered] = np.arange(len(registered))
 
     def rays(self, origins: Array, directions: Array) -> Any:
         """Rays of Mitsuba, in its units and axes."""
-        import mitsuba as mi
-
         start, way = origins @ self.to_scene.T / self.unit, directions @ self.to_scene.T
-        return mi.Ray3f(mi.Point3f(start.T), mi.Vector3f(way.T))
+        return self.mi.Ray3f(self.mi.Point3f(start.T), self.mi.Vector3f(way.T))
 
     def distances(self, origins: Array, directions: Array) -> Array:
         """Metres [R] to the nearest surface, masked or not, as the planner asks; inf where there is none."""
@@ -137,16 +135,13 @@ class Room:
 
     def trace(self, origins: Array, directions: Array) -> tuple[Array, np.ndarray]:
         """Metres [R] to what a picture shows, and parts [R]: twice the place of the shape, plus 1 on its top; inf, -1."""
-        import drjit as dr
-        import mitsuba as mi
-
         distance, part, rest = np.full(len(origins), np.inf), np.full(len(origins), -1), np.arange(len(origins))
         passed = np.zeros(len(origins))
         for _ in range(LAYERS):
             starts = origins[rest] + directions[rest] * passed[:, None]
             hit = self.scene.ray_intersect(self.rays(starts, directions[rest]))
             valid, solid = np.array(hit.is_valid()), np.array(hit.bsdf().eval_null_transmission(hit)[0]) < 0.5
-            shape = self.place[np.array(dr.reinterpret_array(mi.UInt32, hit.shape))]
+            shape = self.place[np.array(self.reinterpret(self.mi.UInt32, hit.shape))]
             top = (np.abs(np.array(hit.n.y)) > 0.7) & (np.array(hit.p.y) > self.tops[shape])
             metres, done = np.array(hit.t) * self.unit + passed, valid & solid
             distance[rest[done]], part[rest[done]] = metres[done], (2 * shape + top)[done]
@@ -157,7 +152,6 @@ class Room:
 
     def picture(self, lens: Lens, pose: Array, spp: int, seed: int, exposure: float) -> np.ndarray:  # [H, W, 3] uint8
         """Path traced with albedo and normals, denoised by them, and encoded with gamma 2.2."""
-        import mitsuba as mi
         import pyoidn
 
         to_world = np.eye(4)
@@ -166,12 +160,11 @@ class Room:
         film = {"type": "hdrfilm", "width": lens.width, "height": lens.height, "rfilter": {"type": "box"}}
         fov = float(np.degrees(2 * np.arctan(lens.width / 2 / lens.focal)))
         sensor = {"type": "perspective", "fov": fov, "fov_axis": "x", "near_clip": 0.01, "far_clip": 1e4, "film": film}
-        sensor |= {"to_world": mi.ScalarTransform4f(to_world), "sampler": {"type": "independent"}}
+        sensor |= {"to_world": self.mi.ScalarTransform4f(to_world), "sampler": {"type": "independent"}}
         path = {"type": "aov", "aovs": "a:albedo,n:sh_normal", "light": {"type": "path", "max_depth": 8}}
-        made = mi.render(self.scene, sensor=mi.load_dict(sensor), integrator=mi.load_dict(path), spp=spp, seed=seed)
-        channels = np.nan_to_num(np.array(made, np.float32))
-        count = channels.shape[2]
-        light, albedo, normal = (np.ascontiguousarray(channels[..., i : i + 3]) for i in (0, count - 6, count - 3))
+        camera, method = self.mi.load_dict(sensor), self.mi.load_dict(path)
+        made = np.array(self.mi.render(self.scene, sensor=camera, integrator=method, spp=spp, seed=seed), np.float32)
+        light, albedo, normal = (np.nan_to_num(part) for part in (made[..., :3], made[..., -6:-3], made[..., -3:]))
         light = np.asarray(pyoidn.denoise(light, np.clip(albedo, 0, 1), np.clip(normal, -1, 1), hdr=True)) * exposure
         return np.round(np.clip(light, 0, 1) ** (1 / 2.2) * 255).astype(np.uint8)
 
