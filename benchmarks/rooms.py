@@ -33,7 +33,6 @@ from PIL import Image
 from rooms_path import Array, Lens, plan_views
 
 VOID = 255
-LAYERS = 8  # masked surfaces (leaves) that a ray may pass
 POINTS, POINT_NOISE = 30_000, 0.01  # of the sparse points; metres
 TOP = " top"  # "Mesh048 top": what lies flat in the upper tenth of a mesh, as a ceiling that is one mesh with its walls
 
@@ -137,7 +136,7 @@ class Room:
         """Metres [R] to what a picture shows, and parts [R]: twice the place of the shape, plus 1 on its top; inf, -1."""
         distance, part, rest = np.full(len(origins), np.inf), np.full(len(origins), -1), np.arange(len(origins))
         passed = np.zeros(len(origins))
-        for _ in range(LAYERS):
+        while len(rest):  # again behind masked surfaces, as leaves are
             starts = origins[rest] + directions[rest] * passed[:, None]
             hit = self.scene.ray_intersect(self.rays(starts, directions[rest]))
             valid, solid = np.array(hit.is_valid()), np.array(hit.bsdf().eval_null_transmission(hit)[0]) < 0.5
@@ -146,8 +145,6 @@ class Room:
             metres, done = np.array(hit.t) * self.unit + passed, valid & solid
             distance[rest[done]], part[rest[done]] = metres[done], (2 * shape + top)[done]
             rest, passed = rest[valid & ~solid], metres[valid & ~solid] + 1e-4
-            if not len(rest):
-                break
         return distance, part
 
     def picture(self, lens: Lens, pose: Array, spp: int, seed: int, exposure: float) -> np.ndarray:  # [H, W, 3] uint8
@@ -245,7 +242,8 @@ def main() -> None:
     if not file.exists():
         if args.out.exists() and any(args.out.iterdir()):
             raise SystemExit(f"{args.out}: expected a new or empty folder, or one that this program began")
-        views = plan_views(room.distances, lens, np.array(about["inside"]), args.train, args.test, args.seed)
+        inside, middle = np.array(about["inside"]), np.array(about["middle"])
+        views = plan_views(room.distances, lens, inside, middle, args.train, args.test, args.seed)
         write(args.out / "CREDIT.txt", about["credit"])
         write(file, {"options": options, "views": {stem: pose.tolist() for stem, pose in views.items()}})
     plan = json.loads(file.read_text(encoding="utf-8"))

@@ -93,8 +93,10 @@ def sees(distances: Distances, lens: Lens, pose: Array) -> bool:
     return bool((hits < NEAR).mean() <= NEAR_SHARE and np.median(hits) >= MEDIAN and np.isinf(hits).mean() < OUTDOORS)
 
 
-def training_path(distances: Distances, lens: Lens, free: Array, count: int, rng: np.random.Generator) -> list[Array]:
-    """Two closed rounds through the free places, looking across: along the walls, then inside with wider swings.
+def training_path(
+    distances: Distances, lens: Lens, free: Array, middle: Array, count: int, rng: np.random.Generator
+) -> list[Array]:
+    """Two closed rounds through the free places, looking past `middle`: along the walls, then inside with wider swings.
 
     Where the sight is blocked, a camera turns until it is not. Returns `count` poses.
     """
@@ -115,8 +117,9 @@ def training_path(distances: Distances, lens: Lens, free: Array, count: int, rng
             ring[tight, :2] += 0.1 * (centre[:2] - ring[tight, :2])
         lengths = np.linalg.norm(np.diff(ring, axis=0, append=ring[:1]), axis=-1).cumsum()
         for i in np.searchsorted(lengths, (np.arange(many) + 0.5) / many * lengths[-1]):
-            yaw = angles[i] + np.pi + np.radians(swing) * np.sin(3 * angles[i] + phase[1])
-            slope = np.tan(np.radians(-10 + 14 * np.sin(5 * angles[i] + phase[2])))
+            way = middle - ring[i]
+            yaw = np.arctan2(way[1], way[0]) + np.radians(swing) * np.sin(3 * angles[i] + phase[1])
+            slope = way[2] / max(np.linalg.norm(way[:2]), 1.0) + 0.25 * np.sin(5 * angles[i] + phase[2])
             yaws = yaw + np.radians([0, 20, -20, 40, -40, 70, -70, 100, -100, 140, -140, 180])
             tries = (look(ring[i], np.array([np.cos(a), np.sin(a), slope])) for a in yaws)
             poses += islice((pose for pose in tries if sees(distances, lens, pose)), 1)
@@ -163,9 +166,11 @@ def test_views(
     raise ValueError(f"test: expected {count} views of what training views saw, got {len(views)}; train more views")
 
 
-def plan_views(distances: Distances, lens: Lens, inside: Array, train: int, test: int, seed: int) -> dict[str, Array]:
-    """The poses of all views by name, train_000 to test_029; `inside` is a place in the room."""
+def plan_views(
+    distances: Distances, lens: Lens, inside: Array, middle: Array, train: int, test: int, seed: int
+) -> dict[str, Array]:
+    """The poses of all views by name, train_000 to test_029; `inside` is a free place, `middle` that of the things."""
     rng, free = np.random.default_rng(seed), free_places(distances, inside)
-    poses = {"train": training_path(distances, lens, free, train, rng)}
+    poses = {"train": training_path(distances, lens, free, middle, train, rng)}
     poses["test"] = test_views(distances, lens, free, poses["train"], test, rng)
     return {f"{split}_{i:03d}": pose for split, views in poses.items() for i, pose in enumerate(views)}

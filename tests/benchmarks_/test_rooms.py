@@ -46,7 +46,7 @@ def to_surface(points):
 
 
 def plan(seed=0, train=10, test=4):
-    return rooms_path.plan_views(distances, LENS, CENTRE, train, test, seed)
+    return rooms_path.plan_views(distances, LENS, CENTRE, TABLE.mean(0), train, test, seed)
 
 
 def test_cameras_stand_free_in_the_room_and_see():
