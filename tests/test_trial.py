@@ -190,3 +190,11 @@ def test_a_splat_with_lost_gaussians_is_shown(field, splat, notes):
     assert 3 not in lines["destination"]
     assert np.isfinite(lines.points).all()
     plotter.close()
+
+
+def test_an_edit_of_a_field_is_one_of_its_labelled_gaussians(field):
+    removed = kfgs.Remove("chair").apply(field)
+    assert isinstance(removed, kfgs.Gaussians)
+    assert len(removed) == len(field) - int((field.label().labels == field.names.index("chair")).sum())
+    refused(lambda: kfgs.Recolor("chair", "teal").apply(field), "gaussians.sh:", "pass the colour field")
+    refused(lambda: kfgs.Remove("chair").apply("run/"), "gaussians:", "SemanticField.load", error=TypeError)

@@ -32,6 +32,7 @@ from .selection import (
     set_fields,
     three_numbers,
 )
+from .transfer import as_cloud
 
 AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 HIDDEN = 1e-6  # an opacity that every renderer skips (alpha < 1/255) and every file can hold
@@ -67,6 +68,7 @@ class OnSelection(Edit):
 
     def apply(self, gaussians: Gaussians) -> Gaussians:
         """See `Edit.apply`."""
+        gaussians = as_cloud(gaussians)
         rules: tuple[Rule, ...] = self.where  # type: ignore[assignment]  # since __post_init__
         mask = torch.stack([rule.select(gaussians).mask for rule in rules]).any(dim=0)
         if not bool(mask.any()):
