@@ -66,3 +66,6 @@ def test_a_splat_without_classes_opens(desk, tmp_path, capsys):
     assert "semantic: 4,000 Gaussians" in view(capsys, tmp_path, desk / "my.ply", "--where", "html")
     header = header_of(tmp_path / "view.html")
     assert (header["classes"], header["query"], header["start"]["show"]) == ([], {}, "color")
+    assert header["up"] == [0, -1, 0]
+    view(capsys, tmp_path, desk / "my.ply", "--where", "html", "--up", "z-down")
+    assert header_of(tmp_path / "view.html")["up"] == [0, 0, -1]

@@ -22,7 +22,7 @@ NOT_YET = {  # what is above its aim: a change may lower these numbers, and neve
 }  # fmt: skip
 SCRIPTS = 4_000  # lines of the viewer's JavaScript
 TESTS = 33_300  # lines of Python in tests/: whoever lowers it brings it nearer to 32_000, and nobody raises it
-PUBLIC, TOP, COMMAND, OPTIONS = 170, 40, 14, 109  # names, of kfgs itself, commands, options; limits: 170, 40, 14, 110
+PUBLIC, TOP, COMMAND, OPTIONS = 170, 40, 14, 110  # names, of kfgs itself, commands, options; limits: 170, 40, 14, 110
 PACKAGES = [folder for folder in AIM if "/" not in folder and folder not in ("cli", "base")]
 
 

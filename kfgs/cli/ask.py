@@ -15,6 +15,7 @@ from .files import is_field, open_field, open_splats, say, wrote
 from .options import Classes, Given, Positional, Teacher
 
 Where = Literal["browser", "html", "window", "picture"]
+Axis = Literal["x", "y", "z", "x-down", "y-down", "z-down"]
 FEW = 0.05  # of a colour cloud within lambda, under which the frames probably differ
 
 
@@ -151,6 +152,7 @@ def view(
     color: Given[Path] = None,
     ask: Given[str] = None,
     where: Where = "browser",
+    up: Given[Axis] = None,
     out: Path = Path("kfgs_view"),
     teacher: Teacher,
     classes: Classes,
@@ -171,8 +173,8 @@ def view(
         color: Colour splat in the same frame, any splat file. Of a field, by default: RUN/color.ply, or the splat it was made on.
         ask: A first question.
         where: browser; html (writes OUT/view.html, one file that any browser opens without kfgs, and ends); window (pyvista:
-            two clouds side by side); or picture (writes OUT/view.png and ends). The first two show small photos of the
-            scene, too.
+            two clouds side by side); or picture (writes OUT/view.png and ends). The first two also show small photos.
+        up: The axis that points up, or down; by default that of the cameras, else y-down. The key R changes it.
         out: Folder for saved pictures and selections.
     """
     from ..fields.store import NAME
@@ -192,6 +194,8 @@ def view(
     meaning, cameras = open_meaning(source, classes, teacher)
     colors = open_colors(source, color, meaning)
     state = Exploration(meaning, None if colors is meaning.gaussians else colors, cameras=cameras)
+    if up is not None:
+        state.up = [(-1.0 if "down" in up else 1.0) * (axis == up[0]) for axis in "xyz"]
     about = state.details().get("color")
     if about and (near := about["total"] - about["none"]) < FEW * about["total"]:
         few = f"only {near:,} of {about['total']:,} colour Gaussians lie within lambda of the field"

@@ -12,6 +12,7 @@ import { Tools } from "./tools.js";
 
 const MODES = { color: "Colour", labels: "Classes", score: "Score", latents: "Latents" };
 const BACKGROUND = { light: [0.957, 0.961, 0.969], dark: [0.094, 0.102, 0.118] };
+const ROLL = Math.PI / 36; // radians
 const GLIDE = 350; // milliseconds of a move to another view
 const SAID = 9000; // milliseconds that a message stays
 const BRUSH = [6, 24, 120]; // pixels: smallest, first, largest radius
@@ -530,7 +531,7 @@ class App {
     const keys = {
       "?": () => this.help.showModal(), "/": () => this.top.search.input.focus(), f: () => this.fit(),
       m: () => this.nextMode(), p: () => this.togglePhoto(), "[": () => this.step(-1), "]": () => this.step(1),
-      x: () => this.setThrough(!this.through), ",": () => this.sizeBrush(0.8), ".": () => this.sizeBrush(1.25),
+      x: () => this.setThrough(!this.through), r: () => (this.eye.roll(event.shiftKey ? ROLL : 0), this.moved()), ",": () => this.sizeBrush(0.8), ".": () => this.sizeBrush(1.25),
       Delete: () => model.remove(), Backspace: () => model.remove(),
       Escape: () => (this.tools.tool === "move" ? model.clear() : this.setTool("move")),
     };

@@ -43,7 +43,7 @@ export function letterboxed({viewmat, K, width, height, near}, toWidth, toHeight
 }
 
 /** A vector turned about a unit axis by an angle in radians (Rodrigues). */
-function turned(v, k, angle) {
+export function turned(v, k, angle) {
   const [c, s] = [Math.cos(angle), Math.sin(angle)];
   return add(add(times(v, c), cross(k, v), s), k, dot(k, v) * (1 - c));
 }

@@ -19,7 +19,7 @@ const LAYOUTS = [["one", "One view"], ["split", "Side by side"], ["slider", "Sli
 const HELP = [
   ["Drag", "turn the view; inside a room: look around"], ["Right drag, Shift + drag", "move it sideways"], ["Middle drag, Ctrl + drag", "look around"], ["Wheel, two fingers, + −", "zoom"],
   ["W A S D, Q E", "fly (Shift: faster)"], ["Click", "pick a Gaussian"], ["Double click", "turn about this point"],
-  ["F", "fit the selection, or the first view"], ["[ ]", "previous and next photo view"], ["P", "photo over the view"],
+  ["F", "fit the selection, or the first view"], ["R, Shift + R", "another axis is up, turn the picture by 5 degrees"], ["[ ]", "previous and next photo view"], ["P", "photo over the view"],
   ["/", "search"], ["M", "next colour mode"], ["1 2 3 4", "move, box, lasso, brush"], ["5", "drag the selection (Shift: up and down)"], [", .", "smaller and larger brush"],
   ["Shift or Alt + tool", "add to or subtract from the selection"], ["X", "select through: also what others hide"], ["Delete", "remove the selection"],
   ["Ctrl + I", "invert the selection"], ["Ctrl + Z, Ctrl + Shift + Z", "undo, redo"],

@@ -1,8 +1,9 @@
 /** The camera that a person moves: a view (camera.js) with its lens and its upward direction. */
 
 import { between, cameraOf, fit, fly, letterboxed, lookAround, lookAt } from "./camera.js";
-import { orbit, pan, viewOf, viewmatOf, zoom } from "./camera.js";
+import { orbit, pan, pivot, turned, viewOf, viewmatOf, zoom } from "./camera.js";
 
+const AXES = [[0, -1, 0], [0, 0, 1], [0, 1, 0], [1, 0, 0], [-1, 0, 0], [0, 0, -1]]; // that may be up
 const FOV = 0.9; // radians, if the scene has no cameras
 const TURN = 0.006; // radians for a pixel
 const FLY = 0.4; // of the scene's radius for a second
@@ -78,6 +79,13 @@ export class Eye {
   turn(dx, dy) {
     this.view = lookAround(this.view, (TURN / 2) * dx, -(TURN / 2) * dy, this.up);
     this.aim();
+  }
+
+  /** Take the next of the axes as up; or turn the picture by an angle in radians. */
+  roll(angle = 0) {
+    const at = AXES.findIndex((axis) => axis.every((value, k) => Math.abs(value - this.up[k]) < 0.01));
+    this.up = angle ? turned(this.up, this.view.R.slice(6), angle) : AXES[(at + 1) % AXES.length];
+    this.view = lookAt(this.view.position, pivot(this.view), this.up);
   }
 
   pan(dx, dy) {

@@ -293,11 +293,6 @@ export class Model extends EventTarget {
     return Object.fromEntries(found.filter(([, rows]) => rows.length));
   }
 
-  /** Undo everything that changed the Gaussians; a step of its own. */
-  restore() {
-    this.step("restore all", { edits: [], clouds: this.original, hand: {} });
-  }
-
   get edited() {
     return this.now.edits.length > 0;
   }

@@ -25,7 +25,6 @@ from ..scenes import Scene
 from ..splat.sh import SH_C0
 from ..viz.colors import COLORMAP, Array
 from ..viz.films import show_photos
-from ..viz.linked import upwards
 from ..viz.palette import palette
 from .state import GREY, Exploration, Side
 
@@ -117,7 +116,7 @@ def pack_scene(state: Exploration, *, title: str = "kfgs", scene: Scene | None =
         "examples": meaning.examples,
         "clim": list(state.clim) if asked is None else [0.0, 1.0],
         "cameras": _add_cameras(buffers, state, scene),
-        "up": upwards(state.cameras),
+        "up": list(state.up),
         "focus": find_focus(state) if state.cameras else None,
         "default_view": 0 if state.cameras else None,
         "query": _add_scores(
@@ -187,7 +186,7 @@ def find_focus(state: Exploration) -> list[float] | None:
     axes = np.stack([as_array(camera.viewmat).astype(np.float64)[2, :3] for camera in state.cameras])
     across = np.eye(3) - axes[:, :, None] * axes[:, None]
     point = np.linalg.lstsq(across.sum(0), np.einsum("cij,cj->i", across, centers), rcond=None)[0]
-    far, up = np.linalg.norm(point - centers, axis=1), np.array(upwards(state.cameras))
+    far, up = np.linalg.norm(point - centers, axis=1), np.array(state.up)
     places = as_array(state.cloud(state.sides[-1]).means) - point
     heights, top, reach = places @ up, ((centers - point) @ up).max(), np.median(far)
     over = (

@@ -12,7 +12,7 @@ const css = (rgb) => `rgb(${rgb.join(",")})`;
  */
 export function makePanel(model, act) {
   const carried = model.carried ? [lambdaPart(model)] : [];
-  const shown = [scorePart(model), pickPart(model), selectionPart(model, act), partsPart(model, act), classesPart(model, act), ...carried];
+  const shown = [scorePart(model), partsPart(model, act), pickPart(model), selectionPart(model, act), classesPart(model, act), ...carried];
   return {
     element: h("aside", { class: "panel", "aria-label": "Search, classes and selection" }, ...shown.map((one) => one.element)),
     refresh: () => shown.forEach((one) => one.refresh()),
@@ -125,7 +125,6 @@ function selectionPart(model, act) {
     recolor,
     h("label", { class: "pair", title: "Make the selection transparent" }, "Opacity", opacity),
   ];
-  const restore = button("Restore all", "Undo all edits", () => model.restore(), { class: "link" });
   const save = button("Save state", "Save question, selection and edits as JSON, to open again", act.save);
   const file = h("input", { type: "file", accept: ".json,application/json", hidden: true, "aria-label": "State to open" });
   file.addEventListener("change", () => (act.open(file.files[0]), (file.value = "")));
@@ -135,17 +134,15 @@ function selectionPart(model, act) {
     button("Save edited scene", "Write the scene with its edits, and the edits as JSON", act.saveEdits),
   ] : [];
   if (act.similar) change.push(button("Similar", "Search for what is like the selection", act.similar));
-  const split = act.split ? [button("Parts", "List the connected parts of the selection: chair 1, chair 2", act.split)] : [];
-  change.push(...split);
+  if (act.split) change.push(button("Parts", "List the connected parts of the selection: chair 1, chair 2", act.split));
   const boxes = h("div", {}, h("div", { class: "buttons" }, ...change), h("div", { class: "buttons" }, ...edits));
-  const element = section("Selection", restore, said, boxes, h("div", { class: "buttons" }, ...files, save, open, file));
+  const element = section("Selection", said, boxes, h("div", { class: "buttons" }, ...files, save, open, file));
   const refresh = () => {
     const count = model.counts(model.side).selected;
     const other = model.sides.find((side) => side !== model.side && model.counts(side).selected > 0);
     boxes.hidden = !count && !other;
     save.hidden = boxes.hidden && !model.edited;
     if (files.length) [files[0].hidden, files[1].hidden] = [boxes.hidden, !model.edited];
-    restore.hidden = !model.edited;
     recolor.hidden = !model.sides.some((side) => model.clouds[side].colored && model.counts(side).selected);
     if (model.now.what !== "opacity") opacity.value = 100;
     const more = other ? `, and ${whole(model.counts(other).selected)} ${SIDE_WORDS[other]} ones` : "";
@@ -169,6 +166,7 @@ function partsPart(model, act) {
     const row = ({ count }, at) =>
       h("li", {}, textButton(`${name} ${at + 1}`, choose(at), { class: "name", title: "Select this part" }), h("span", { class: "count" }, whole(count)));
     list.replaceChildren(...parts.map(row));
+    element.scrollIntoView({ block: "nearest" });
   };
   return { element, refresh };
 }

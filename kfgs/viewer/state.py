@@ -17,6 +17,7 @@ from ..gaussians import Gaussians
 from ..labels.transfer import Sources, positions
 from ..splat.sh import sh0_to_rgb
 from ..viz.colors import Array, FeatureColors, cloud_colors
+from ..viz.linked import upwards
 from ..viz.palette import UNLABELLED, palette
 from ..viz.pictures import as_bytes
 from .meaning import Asked, Meaning
@@ -25,6 +26,7 @@ Side = Literal["semantic", "color"]
 Show = Literal["labels", "rgb", "score", "latents"]
 SIDE_WORDS: dict[Side, str] = {"semantic": "semantic", "color": "colour"}
 GREY = np.array(UNLABELLED, dtype=np.uint8)
+DOWN_Y = (0.0, -1.0, 0.0)  # up in nearly all files of splats without cameras: y points down
 SPAN = 30.0  # the lambda slider reaches from a 30th of the suggestion to 30 times it
 
 
@@ -77,6 +79,7 @@ class Exploration:
         self.meaning = meaning
         self.cameras = tuple(camera.with_origin(semantic.origin) for camera in cameras)
         self.sides: tuple[Side, ...] = tuple(self._clouds)
+        self.up: Sequence[float] = upwards(cameras) if cameras else DOWN_Y
         self._own_labels = as_array(semantic.labels).astype(np.int64)
         self.source, self.far, suggested, self.distance_how = self._find_sources()
         self._base: dict[Side, Array] = {}

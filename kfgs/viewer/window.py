@@ -16,7 +16,7 @@ from ..cameras.camera import NEAR
 from ..viz.clouds import add_cloud, recolor_cloud
 from ..viz.colors import COLORMAP, Array
 from ..viz.legends import add_legend, add_title, letters
-from ..viz.linked import look_over, upwards
+from ..viz.linked import look_over
 from ..viz.pictures import save_picture
 from ..viz.plotter import has_display, look_through, make_plotter
 from .meaning import Asked
@@ -87,7 +87,7 @@ class Explorer(AbstractContextManager["Explorer"]):
         """Look through a posed camera: its whole picture, at its aspect ratio; None: at everything but floaters."""
         self.plotter.subplot(0, 0)
         if camera is None:
-            look_over(self.plotter, upwards(self.state.cameras))
+            look_over(self.plotter, self.state.up)
             return
         width, height = self.plotter.window_size
         width //= len(self.state.sides)
