@@ -65,7 +65,7 @@ def test_no_source_and_no_harmonics():
     assert buffer(packed, "color/source").tolist() == [-1]
     assert np.isinf(buffer(packed, "color/far")).all()
     assert packed.header["sides"]["color"]["sh_degree"] is None
-    assert packed.header["up"] == [0, 0, 1]
+    assert packed.header["up"] == [0, -1, 0]
     assert packed.header["default_view"] is None
 
 
