@@ -120,7 +120,7 @@ def test_one_person_everywhere(browser, tmp_path, home):
             bits = np.packbits(selected, bitorder="little").tobytes()
             assert base64.b64decode(saved["sides"]["color"]["selected"]) == bits
         else:
-            page.click("text=Parts")
+            page.click("button:text-is('Parts')")
             page.click("li:has-text('chair 1') button, li:has-text('part 1') button")
             part = mask(page, "color")
             assert 0 < part.sum() <= selected.sum()
