@@ -15,7 +15,6 @@ from .files import is_field, open_field, open_splats, say, wrote
 from .options import Classes, Given, Positional, Teacher
 
 Where = Literal["browser", "html", "window", "picture"]
-Axis = Literal["x", "y", "z", "x-down", "y-down", "z-down"]
 FEW = 0.05  # of a colour cloud within lambda, under which the frames probably differ
 
 
@@ -152,7 +151,7 @@ def view(
     color: Given[Path] = None,
     ask: Given[str] = None,
     where: Where = "browser",
-    up: Given[Axis] = None,
+    up: Given[Literal["x", "y", "z", "x-down", "y-down", "z-down"]] = None,
     out: Path = Path("kfgs_view"),
     teacher: Teacher,
     classes: Classes,
