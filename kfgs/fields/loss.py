@@ -28,8 +28,8 @@ def l1_loss(
 ) -> Tensor:  # []
     """Eq. 4: the rendered map F_r, resized bilinearly to the target's size, against the latent map F_l.
 
-    A map that is more than twice as large is averaged over each pixel of the target: of 640x480 to 46x34, bilinear sampling
-    reads 4 of 196 pixels, and only these would learn.
+    A map that is more than twice as high and wide is averaged over each pixel of the target: of 640x480 to 46x34, bilinear
+    sampling reads 4 of 196 pixels, and only these would learn.
 
     The mean of the absolute differences over pixels and channels. The paper writes a norm, but its released script takes
     the mean, and learning rates and densification threshold of 3DGS are made for a mean. Pixels with NaN in any channel of
@@ -92,7 +92,7 @@ def mean_similarity(picture: Tensor, target: Tensor) -> Tensor:  # [H, W, D] x 2
 def _resized(rendered: Tensor, target: Tensor) -> Tensor:  # [H, W, D], [h, w, D] -> [h, w, D]
     check_shapes(("rendered", rendered, ("H", "W", target.shape[2])))  # compiled code would read beyond the smaller one
     size = target.shape[0], target.shape[1]
-    if rendered.shape[0] > MOST_SKIPPED * size[0] or rendered.shape[1] > MOST_SKIPPED * size[1]:
+    if rendered.shape[0] > MOST_SKIPPED * size[0] and rendered.shape[1] > MOST_SKIPPED * size[1]:
         return from_bchw(torch.nn.functional.adaptive_avg_pool2d(to_bchw(rendered), size))
     return resize_map(rendered, size)
 
