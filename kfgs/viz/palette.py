@@ -90,21 +90,22 @@ def palette(
 def name_slots(names: Sequence[str]) -> list[int]:
     """The place in `PALETTE` of each class; the order of the names has no influence.
 
-    The home of `class 7` is 7. Words of indoor scenes have one among the first 20 colours, shared by words of one meaning
-    (sofa, couch). Other words get one from their CRC-32. If two names of a list share a home, the first word of the row stays
-    there, of other words the first in the alphabet. Others move to the next free colour: of the first 20, of 64, of 256.
+    Words of indoor scenes have a home among the first 20 colours, shared by words of one meaning (sofa, couch). Others get
+    one from their CRC-32. If two names share a home, the first word of the row stays there, of other words the first in the
+    alphabet; others move to the next free colour: of the first 20, of 64, of 256. `class 7` has colour 7, or one from the end.
     """
     words = [" ".join(name.lower().replace("_", " ").replace("-", " ").split()) for name in names]
     slots: dict[int, int] = {}
-    order = sorted(range(len(names)), key=lambda i: (_RANKS.get(words[i], 0), words[i], i))
-    for i in order:
-        number = words[i].removeprefix("class ")
-        home = int(number) if number.isdecimal() else _HOMES.get(words[i])
-        if home is not None and home not in slots.values():
+    digits = {i: word.removeprefix("class ") for i, word in enumerate(words)}
+    numbers = {i: int(number) % TIERS[-1] for i, number in digits.items() if number.isdecimal()}
+    named = sorted(set(range(len(names))) - set(numbers), key=lambda i: (_RANKS.get(words[i], 0), words[i], i))
+    for i in named:
+        if (home := _HOMES.get(words[i])) is not None and home not in slots.values():
             slots[i] = home
-    for i in order:
-        if i not in slots:
-            slots[i] = _free_slot(words[i], set(slots.values()))
+    for i in named:
+        slots.setdefault(i, _free_slot(words[i], set(slots.values())))
+    moved = {slot: TIERS[-1] - 1 - k for k, slot in enumerate(sorted(slots.values()))}
+    slots |= {i: moved.get(number, number) for i, number in numbers.items()}
     return [slots[i] for i in range(len(names))]
 
 

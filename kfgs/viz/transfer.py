@@ -106,9 +106,8 @@ class _Picture:
         self.distance = tree.default_distance(targets[known])[0] if distance is None else distance
         check_range("distance", self.distance, 0, closed=(False, False))
         self.distances, self.givers = np.full(len(known), np.inf), np.full(len(known), -1)
-        self.distances[known], self.givers[known] = tree.nearest(
-            targets[known], REACH * self.distance
-        )  # the slider's end
+        reach = REACH * self.distance  # the slider's end
+        self.distances[known], self.givers[known] = tree.nearest(targets[known], reach)
         self.labels = np.append(classes, -1)[self.givers]
         nearest = range(1, min(NEIGHBOURS, len(tree.index)) + 1)
         far, neighbours = tree.tree.query(np.nan_to_num(targets), [*nearest], workers=-1)

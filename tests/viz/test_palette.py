@@ -53,6 +53,16 @@ def test_names_that_share_a_home():
     assert max(name_slots([*ROOM, "a word of its own"])) < 20
 
 
+def test_a_class_without_a_name_takes_no_colour_from_one_with_a_name():
+    named = ["zebra", "floor", "sofa"]
+    slots = name_slots([*named, *(f"class {i}" for i in range(3, 40))])
+    assert slots[:3] == name_slots(named)
+    assert all(slots[k] == k for k in range(3, 40) if k not in slots[:3])
+    assert len(set(slots)) == 40
+    assert name_slots([*named, "class 3", "class 4"]) == slots[:5]  # a crop has the colours of its cloud
+    assert name_slots(["class 1000", str(10**30)])[0] == 1000 % 256
+
+
 def test_the_order_of_names_does_not_matter():
     names = [*ROOM, "thing", "sky", "couch", "vase"]
     slots = dict(zip(names, name_slots(names), strict=True))
