@@ -69,12 +69,12 @@ class Shared(HasTraits):
         state, wire = self.state, self.wire | told
         if wire["lambda"] is not None and np.float32(wire["lambda"]) != np.float32(state.distance):
             state.set_distance(wire["lambda"])
-        wire["lambda"] = wire["lambda"] and state.distance  # which JavaScript rounds to float32
         if wire["words"] != (state.asked and state.asked.words):
             state.ask(wire["words"])
         if state.asked is not None and wire["gamma"] not in (None, state.gamma):
             state.set_gamma(wire["gamma"])
-        self.wire = wire
+        # JavaScript rounds lambda to float32, and has a gamma without words after "like the selection"
+        self.wire = wire | {"lambda": wire["lambda"] and state.distance, "gamma": state.gamma}
         self._refresh(("camera",) if told.keys() == {"view"} else NAMES)
 
     def tell(self) -> None:

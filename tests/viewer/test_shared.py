@@ -57,6 +57,16 @@ def test_what_is_set_before_a_browser_shows_it_waits_in_the_wire(viewer):
     assert (viewer.gamma, len(viewer.selection), wire["words"]) == (None, 0, "chair")
 
 
+def test_like_the_selection_has_a_gamma_without_words(viewer):
+    viewer.ask("table")
+    seen = []
+    viewer.observe(lambda change: seen.append(change["new"]), "selection")
+    sides, mask = viewer.wire["sides"], np.arange(450) % 3 == 0
+    heard(viewer, words=None, gamma=0.7, sides=sides | {"color": sides["color"] | {"selected": bits(mask)}})
+    assert (viewer.question, viewer.gamma) == (None, None)
+    assert seen[-1].mask.tolist() == viewer.selection.mask.tolist() == mask.tolist()
+
+
 def test_a_selection_is_a_mask_a_rule_or_an_answer_of_either_cloud(viewer):
     state = viewer.state
     viewer.ask("table")
