@@ -14,7 +14,7 @@ from kfgs import viz
 from kfgs.cameras import Orbit, orbit_cameras
 from kfgs.evaluation import evaluate_segmentation
 from kfgs.fields import Identity
-from kfgs.labels import InBox, OfClass, nearest_labels
+from kfgs.labels import EditList, InBox, Insert, OfClass, nearest_labels
 
 
 @pytest.fixture(scope="module")
@@ -192,9 +192,12 @@ def test_a_splat_with_lost_gaussians_is_shown(field, splat, notes):
     plotter.close()
 
 
-def test_an_edit_of_a_field_is_one_of_its_labelled_gaussians(field):
+def test_an_edit_of_a_field_is_one_of_its_labelled_gaussians(field, splat, tmp_path):
     removed = kfgs.Remove("chair").apply(field)
     assert isinstance(removed, kfgs.Gaussians)
     assert len(removed) == len(field) - int((field.label().labels == field.names.index("chair")).sum())
+    kfgs.write_splats(splat, tmp_path / "more.ply")
+    refused(lambda: Insert(tmp_path / "more.ply").apply(field), "sh:", "none in the scene")
+    assert isinstance(EditList([]).apply(field), kfgs.Gaussians)
     refused(lambda: kfgs.Recolor("chair", "teal").apply(field), "gaussians.sh:", "pass the colour field")
     refused(lambda: kfgs.Remove("chair").apply("run/"), "gaussians:", "SemanticField.load", error=TypeError)

@@ -21,6 +21,7 @@ from ..formats.table import read_splats
 from ..gaussians import Gaussians
 from .edits import Duplicate, Edit, Extract, Move, Opacity, Recolor, Remove, transformed
 from .selection import class_names, read_object, set_fields
+from .transfer import as_cloud
 
 FORMAT, VERSION = "kfgs.edits", 1
 
@@ -48,7 +49,7 @@ class Insert(Edit):
 
     def apply(self, gaussians: Gaussians) -> Gaussians:
         """See `Edit.apply`."""
-        part = read_splats(self.source)
+        gaussians, part = as_cloud(gaussians), read_splats(self.source)
         if self.similarity is not None:
             part = transformed(part, self.similarity, gaussians.origin)
         return join(gaussians, part)
@@ -110,6 +111,7 @@ class EditList:
 
     def apply(self, gaussians: Gaussians) -> Gaussians:
         """The cloud after all edits; a ValueError says which one cannot be done."""
+        gaussians = as_cloud(gaussians)
         for i, edit in enumerate(self.edits):
             try:
                 gaussians = edit.apply(gaussians)
