@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from kfgs.toy.geometry import Places, Solid, Texture
-from kfgs.toy.light import LAMPS, lamps_seen
+from kfgs.toy.light import LAMPS, lamps_seen, openness
 
 SKIN = Texture("plaster", ((0.5, 0.5, 0.5), (0.6, 0.6, 0.6)))
 LAMP = LAMPS[0]
@@ -41,3 +41,11 @@ def test_no_solid_shades_itself_and_walls_cast_no_shadow():
     assert lamps_seen([table], facing_up(top - [0, 0, 1.0]))[0, 0] < 0.02
     wall = Solid("box", table.center, table.half, table.yaw, "wall", SKIN)
     assert lamps_seen([wall], facing_up(top - [0, 0, 1.0]))[0, 0] == 1.0
+
+
+@pytest.mark.parametrize("shape", ["box", "ellipsoid"])
+def test_corners_and_places_beside_furniture_are_less_open(shape):
+    beside, near, far = openness([piece(shape, z=0.3, half=(0.3, 0.3, 0.3))], facing_up(on_floor([0.31, 0.5, 2.0])))
+    assert beside < near < far
+    dark, light = openness([], facing_up(np.array([[-2.9, -2.4, 0.0], [0.0, 0.0, 0.0]])))
+    assert dark < 0.8 < light <= 1.0
