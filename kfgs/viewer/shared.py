@@ -22,6 +22,7 @@ from .pack import pack_camera
 from .session import EDITS, labelled
 from .state import Exploration, Picked, Side
 
+USUAL = ("scale", 1), ("mode", "tint")  # of edits that the browser does
 NAMES = ("question", "gamma", "distance", "hidden", "side", "selection", "edits", "picked", "camera")
 
 
@@ -212,12 +213,7 @@ def _numbered(edits: Iterable[Edit], cloud: Gaussians) -> list[dict[str, Any]]:
     gone: list[int] = []
     for place, edit in enumerate(edits):
         plain = {key: part for key, part in edit.to_json().items() if key != "pivot"}
-        if (
-            edit.op not in EDITS
-            or "rotation" in plain
-            or plain.get("scale", 1) != 1
-            or plain.get("mode", "tint") != "tint"
-        ):
+        if edit.op not in EDITS or "rotation" in plain or any(plain.get(key, usual) != usual for key, usual in USUAL):
             raise ValueError(
                 f"edits[{place}]: expected {', '.join(EDITS)} (without rotation, scale and mode 'hue'), got {edit!r:.80}; "
                 "apply it to the Gaussians, and explore the result"

@@ -150,7 +150,8 @@ class Viewer(Shared):
         self._widget: Any = None
 
     def ask(self, words: str | None) -> None:
-        """Set `question`: search for a class or a phrase; None clears the search."""
+        """Set `question`: search for a class or a phrase; None clears the search. A selection by hand goes."""
+        self.question = None  # else the same words again would change nothing
         self.question = words
 
     def tell(self) -> None:

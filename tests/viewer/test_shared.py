@@ -57,6 +57,15 @@ def test_what_is_set_before_a_browser_shows_it_waits_in_the_wire(viewer):
     assert (viewer.gamma, len(viewer.selection), wire["words"]) == (None, 0, "chair")
 
 
+def test_asked_again_a_question_replaces_a_selection_by_hand(viewer):
+    viewer.ask("chair")
+    asked = viewer.selection.mask
+    viewer.selection = ~asked
+    viewer.ask("chair")
+    assert torch.equal(viewer.selection.mask, asked)
+    assert {own["selected"] for own in viewer.wire["sides"].values()} == {None}
+
+
 def test_like_the_selection_has_a_gamma_without_words(viewer):
     viewer.ask("table")
     seen = []
