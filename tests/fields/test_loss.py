@@ -102,3 +102,13 @@ def test_a_target_that_needs_a_gradient_gets_one(measure):
     (found,) = torch.autograd.grad(measure(a, a[..., 0], b), b)
     (expected,) = torch.autograd.grad(measure(b, b[..., 0], a), b)
     torch.testing.assert_close(found, expected)
+
+
+@pytest.mark.parametrize(("size", "shown"), [((4, 3), 1.0), ((12, 9), 1.0), ((4, 30), 1 / 3)])
+def test_every_rendered_pixel_learns_from_a_small_target(size, shown):
+    rendered = torch.rand(24, 18, 2, generator=torch.Generator().manual_seed(0)).requires_grad_()
+    loss = l1_loss(rendered, torch.ones(24, 18), torch.full((*size, 2), 2.0))
+    loss.backward()
+    assert float(rendered.grad.ne(0).any(dim=2).double().mean()) == pytest.approx(shown)
+    if size == (4, 3):  # each of its pixels is the mean of 6 x 6
+        assert loss.item() == pytest.approx(2 - rendered.mean().item())
