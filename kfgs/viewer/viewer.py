@@ -130,9 +130,7 @@ class Viewer(Shared):
     after that, page and Python are independent. `scene` has the photos of the cameras, found by name; `out` is the folder for
     files, on the machine of this program; `height` of the widget is in CSS pixels.
 
-    Example:
-        >>> viewer.gamma = 0.6  # doctest: +SKIP
-        >>> plant = splat[viewer.selection]  # what was selected in the widget, or by the question  # doctest: +SKIP
+    `viewer.gamma = 0.6` moves the slider, and `splat[viewer.selection]` is what was selected by hand or by the question.
     """
 
     def __init__(
