@@ -103,6 +103,8 @@ class Shared(HasTraits):
         if name == "picked" and not isinstance(value, Picked | None):
             check_whole("picked", value, 0, len(state.cloud(self.side)) - 1)
             return state.describe(self.side, value)
+        if name == "edits" and not isinstance(value, EditList):
+            return EditList(value or ())
         if name == "selection" and not isinstance(value, Selection):
             cloud = labelled(state, self.side)
             return value.select(cloud) if isinstance(value, Rule) else Selection.of(as_tensor("selection", value))

@@ -202,6 +202,10 @@ def test_what_cannot_be_set_is_refused_and_changes_nothing(viewer, name, value, 
     assert before == (viewer.wire, [getattr(viewer, own) for own in NAMES if own != "selection"])
 
 
+def test_edits_of_another_kind_name_the_list(viewer):
+    refused(lambda: setattr(viewer, "edits", Remove("chair")), "edits:", "[Remove('chair')]", error=TypeError)
+
+
 def test_a_splat_without_classes_can_be_selected_and_edited():
     cloud = cases_page.exploration().cloud("color")
     viewer = Viewer(Exploration(SplatMeaning(cloud)))
