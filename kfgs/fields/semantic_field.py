@@ -18,7 +18,8 @@ from ..gaussians import Gaussians, as_rows
 from ..labels import LabelSet, Selection
 from ..labels.classify import Classification
 from ..labels.label_set import Classes, Negatives, check_rows, class_rows, make_question
-from ..labels.scores import Score, select_by_similarity
+from ..labels.scores import Score
+from ..labels.selection import select_by_similarity
 from ..metrics import MIB, semantic_storage_bytes
 from ..splat import Ranked, Rendering, rasterize
 from ..splat.rasterize import Votes, rank_votes

@@ -5,8 +5,7 @@ from .edit_list import EditList, Insert
 from .edits import Duplicate, Extract, Move, Opacity, Recolor, Remove
 from .label_set import LabelSet, load_label_set
 from .parts import OrientedBox, Part, connected_parts
-from .scores import relevancy
-from .selection import InBox, OfClass, Selection
+from .selection import InBox, OfClass, Selection, relevancy
 from .transfer import Transfer, nearest_labels, transfer_labels
 
 __all__ = [

@@ -205,12 +205,14 @@ def make_question(
         against = as_tensor("negatives", negatives, floating=True)
         check_rows("negatives", against, ("M",), dim)
         return torch.cat([row[None], against.to(row)])
-    check_choice("negatives", negatives, get_args(Negatives))
     rows = row.new_zeros(0, dim) if rows is None else rows
-    others, canonical = rows[_unlike(rows, row)], _canonical(table, words, row)
-    of_class = isinstance(target, str) or len(others) < len(rows)
-    auto = others if of_class and len(others) else canonical
-    against = {"auto": auto, "classes": others, "canonical": canonical, "none": rows[:0]}[negatives]
+    against = rows[_unlike(rows, row)]
+    of_class = isinstance(target, str) or len(against) < len(rows)
+    if negatives == "canonical" or (negatives == "auto" and not (of_class and len(against))):
+        against = _canonical(table, words, row)
+    elif negatives not in ("auto", "classes"):
+        check_choice("negatives", negatives, get_args(Negatives))
+        against = rows[:0]
     if len(against) == 0 and negatives == "classes":
         raise ValueError(f"negatives: expected other classes than {words!r}, got none; use 'canonical' or 'none'")
     if len(against) == 0 and negatives == "canonical":

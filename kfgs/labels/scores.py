@@ -1,18 +1,14 @@
-"""From cosines to a selection (Sec. 3.4): relevancy, and gamma, the threshold that the score of a selected Gaussian exceeds."""
+"""Gamma, the threshold that the score of a selected Gaussian exceeds (Sec. 3.4), found in the scores; and LERF's constants."""
 
 from __future__ import annotations
 
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
-import torch
 from scipy.ndimage import gaussian_filter1d
 from torch import Tensor
 
 from .._arrays import Array
-from .._check import check_choice, check_range, check_shapes
-from .._rows import check_finite
-from .selection import Selection
 
 TEMPERATURE = 10.0  # factor of the cosines in LERF (Kerr 2023)
 CANONICAL = ("object", "things", "stuff", "texture")  # LERF's negatives for a scene without known classes
@@ -28,60 +24,6 @@ SHARES = ((0.5, CLEAR), (0.75, 0.7))
 """A gap with more than half of the scene above it usually separates two parts of the background. If there is no other, up
 to three quarters may lie above it (the walls of a room), if it is 5 times sparser than the modes next to it."""
 TOP, WAY = 0.999, 0.7  # if no gap is clear: 70 % of the way from the median to the 99.9 % quantile
-
-
-def relevancy(
-    similarity: Tensor,  # [N]
-    negatives: Tensor,  # [N, M]
-) -> Tensor:  # [N] in (0, 1)
-    """LERF's relevancy (Kerr 2023, Sec. 3.4): how much more similar to the query than to the most similar negative.
-
-    min over j of the first entry of softmax(10 [s, n_j]), which is sigmoid(10 (s - max_j n_j)), from cosines with the query
-    and with negatives (the other classes of the scene, or `LabelSet.negatives`). Above 0.5 the query is more similar than
-    every negative. A ValueError if shapes disagree, there is no negative, or a number is not finite.
-
-    Example:
-        >>> relevancy(torch.tensor([0.9, 0.3]), torch.tensor([[0.2, 0.9], [0.1, 0.2]])).tolist()
-        [0.5, 0.7310585975646973]
-    """
-    check_shapes(("similarity", similarity, "N"), ("negatives", negatives, "N M"))
-    if negatives.shape[1] == 0:
-        raise ValueError("negatives: expected at least one column, got none; pass what the query should not find")
-    check_finite("similarity", similarity)
-    check_finite("negatives", negatives)
-    return torch.sigmoid(TEMPERATURE * (similarity - negatives.amax(dim=1)))
-
-
-def select_by_similarity(
-    similarity: Tensor,  # [N]
-    negatives: Tensor | None = None,  # [N, M]
-    threshold: float | None = None,
-    known: Tensor | None = None,  # [N] bool
-    score: Score | None = None,
-) -> Selection:
-    """Select the Gaussians with a score above gamma, from cosines with a query and its negatives (`SemanticField.query`).
-
-    Without a `threshold`, gamma is 0.5 for a relevancy: more similar to the query than to any negative. For a cosine,
-    `similarity_threshold` finds it in the scores. Gaussians that are not `known` have score 0 and no influence on gamma. On
-    room_0 (mean IoU over 18 classes with the data set's labels): cosine 0.88, relevancy 0.90.
-    """
-    score = score or ("cosine" if negatives is None else "relevancy")
-    check_choice("score", score, get_args(Score))
-    gamma, how, scores = threshold, "given", similarity
-    check_finite("similarity", similarity)
-    if score == "relevancy":
-        if negatives is None:
-            raise ValueError("negatives: expected some for a relevancy, got none; pass words that are not meant")
-        scores = relevancy(similarity, negatives)
-        if gamma is None:
-            gamma, how = EVEN, f"more like the query than like any of {negatives.shape[1]} negatives"
-    if threshold is not None:
-        check_range("threshold", threshold, -1 if score == "cosine" else 0, 1)
-    known = torch.ones_like(similarity, dtype=torch.bool) if known is None else known
-    scores = scores.masked_fill(~known, 0)
-    if gamma is None:
-        gamma, how = similarity_threshold(scores[known])
-    return Selection((scores > gamma) & known, scores, float(gamma), how)
 
 
 def similarity_threshold(scores: Tensor) -> tuple[float, str]:  # scores: [N]

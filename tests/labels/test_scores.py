@@ -6,7 +6,8 @@ import torch
 from messages import refused
 
 from kfgs.labels import relevancy
-from kfgs.labels.scores import select_by_similarity, similarity_threshold
+from kfgs.labels.scores import similarity_threshold
+from kfgs.labels.selection import select_by_similarity
 
 
 def oracle(similarity, negatives):

@@ -5,7 +5,7 @@ from messages import refused, tells
 from PIL import Image
 
 from kfgs.labels import Selection
-from kfgs.labels.scores import select_by_similarity
+from kfgs.labels.selection import select_by_similarity
 from kfgs.viz import palette, plot_history, plot_iou, plot_scores
 
 HISTORY = [{"epoch": i, "size": 8 + 2 * i, "loss": 1 / (i + 1), "coverage": i / 9, "note": "text"} for i in range(10)]
