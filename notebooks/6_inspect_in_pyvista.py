@@ -147,9 +147,8 @@ Image.fromarray(viz.draw_view(view, draw_parts))
 
 # %%
 with kfgs.explore(field, color, classes=classes, cameras=[camera, *cameras], where="picture", height=420) as view:
-    view.ask(word)
+    print(view.ask(word).selection)
     view.set_gamma(0.8)
-    print("\n".join(view.lines()))
     picture = view.screenshot()
 Image.fromarray(picture)
 
