@@ -97,7 +97,7 @@ def pack_scene(state: Exploration, *, title: str = "kfgs", scene: Scene | None =
     buffers.add("semantic/labels", labels.astype(np.int16))
     buffers.add("semantic/label_scores", scores.astype(np.float32))
     if "latents" in state.show_choices:
-        buffers.add("semantic/latents", state.latents())
+        buffers.add("semantic/latents", state.latents)
     if "color" in state.sides:
         buffers.add("color/source", state.source.astype(np.int32))
         buffers.add("color/far", rounded_far(state.far, state.distance))

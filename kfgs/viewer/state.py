@@ -5,6 +5,7 @@ from __future__ import annotations
 import numbers
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
@@ -192,7 +193,7 @@ class Exploration:
             return palette(self.labels(side), self.meaning.names)
         if self.show == "score":
             return cloud_colors(self.cloud(side), self.scores(side), clim=self.clim).rgb
-        return self.base_colors(side) if self.show == "rgb" else self._on(side, self.latents(), GREY)
+        return self.base_colors(side) if self.show == "rgb" else self._on(side, self.latents, GREY)
 
     def base_colors(self, side: Side) -> Array:  # [N, 3] uint8
         """The colours of a side from everywhere; if it has none, those of the nearest Gaussians of the other side."""
@@ -206,6 +207,7 @@ class Exploration:
                 self._base[side] = self.base_colors(other)[tree.query(as_array(own.means), workers=-1)[1]]
         return self._base[side]
 
+    @cached_property
     def latents(self) -> Array:  # [S, 3] uint8
         """The latents of the semantic side as colours; grey if a latent was never learnt."""
         features = self._clouds["semantic"].features
