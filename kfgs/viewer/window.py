@@ -153,7 +153,7 @@ class Explorer(AbstractContextManager["Explorer"]):
                 if state.show == "rgb":
                     colors = np.where(rest[:, None], colors, (colors + HIGHLIGHT) // 2).astype(np.uint8)
                 if self.style == "points":
-                    colors[rest] = 215 + colors[rest] // 8
+                    colors = np.where(rest[:, None], 215 + colors // 8, colors)  # the state keeps its own
                 opacities = np.where(rest, REST * opacities, opacities)
             recolor_cloud(self._actors[column], colors, None if self.style == "points" else opacities)
             question = "" if state.asked is None else f"{state.asked.words!r}, "
