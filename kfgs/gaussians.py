@@ -29,7 +29,7 @@ class Gaussians:
     `features`, a colour field `sh`. NumPy arrays are accepted and become tensors that share their memory.
     A scene far from zero (UTM, ECEF) has an `origin`: float32 has about 7 digits, so `means` are counted from there.
 
-    `gaussians[mask]` (or an index, a slice, a `Selection`) is a new, smaller cloud; `len` counts the Gaussians.
+    `gaussians[mask]` (or an index, a slice, a `Selection`, a rule) is a new, smaller cloud; `len` counts the Gaussians.
 
     Example:
         >>> cloud = Gaussians(torch.eye(3), torch.ones(3, 4), torch.ones(3, 3), torch.tensor([0.1, 0.5, 0.9]))
@@ -106,15 +106,15 @@ class Gaussians:
         """Some of the Gaussians as a new cloud; `gaussians[which]` is the same.
 
         Args:
-            which: a mask [N], indices [n] in any order, a slice, one index, or a `Selection`. Tensors, NumPy arrays and
-                lists are taken.
+            which: a mask [N], indices [n] in any order, a slice, one index, a `Selection`, or a rule like `OfClass`. Tensors,
+                NumPy arrays and lists are taken.
 
         Raises:
             ValueError: if a mask is not [N].
             TypeError: if it is neither a mask nor whole numbers.
             IndexError: if there is no such Gaussian.
         """
-        index = as_rows("which", which, len(self)).to(self.means.device)
+        index = as_rows("which", which, self).to(self.means.device)
         rows = index.cpu().numpy() if self.extra else None
         extra = {name: np.asarray(column)[rows] for name, column in self.extra.items()}
         return self.replace(**{name: value[index] for name, value in self.tensors().items()}, extra=extra)
@@ -169,23 +169,23 @@ class Gaussians:
         return first.replace(**tensors, extra=extra)
 
 
-def as_rows(name: str, which: Any, count: int) -> Tensor:  # [count] bool, or [n] whole numbers
-    """Which of `count` Gaussians, in any form that `Gaussians.select` takes and with its errors, as a tensor to index with."""
+def as_rows(name: str, which: Any, cloud: Any) -> Tensor:  # [N] bool, or [n] whole numbers
+    """Which Gaussians of a cloud or a field, in any form that `Gaussians.select` takes and with its errors, as an index."""
+    which, count = which(cloud) if callable(which) else which, len(cloud)  # a rule of labels/selection.py is called
     which = getattr(which, "mask", which)
     if isinstance(which, slice):
         return torch.from_numpy(np.arange(*which.indices(count)))
     if not isinstance(which, Tensor):
         numbers = isinstance(which, int | np.integer | list | tuple | range) or hasattr(which, "__array__")
         if isinstance(which, Gaussians) or not numbers:
-            got = f"{type(which).__name__}; pass a Selection (OfClass('chair').select(cloud)), a mask or indices"
+            got = f"{type(which).__name__}; pass a rule like OfClass('chair'), a Selection, a mask or indices"
             raise TypeError(f"{name}: expected a mask or whole numbers, got {got}")
         which = as_tensor(name, which)
-    rows = which.long() if which.numel() == 0 and which.dtype != torch.bool else which
+    rows = torch.atleast_1d(which.long() if which.numel() == 0 and which.dtype != torch.bool else which)
     if rows.dtype == torch.bool and rows.shape != (count,):
         raise ValueError(f"{name}: expected a mask [N] with N = {count}, got {tuple(rows.shape)}")
     if rows.is_floating_point():
         raise TypeError(f"{name}: expected a mask or whole numbers, got {rows.dtype}; compare first, as in x > 0.5")
-    rows = rows.reshape(-1) if rows.ndim == 0 else rows
     if rows.dtype != torch.bool and bool((wrong := (rows < -count) | (rows >= count)).any()):
         raise IndexError(f"{name}: expected indices below {count} (the number of Gaussians), got {int(rows[wrong][0])}")
     return rows

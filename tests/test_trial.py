@@ -137,16 +137,18 @@ def test_13_two_fields_as_one_cloud(field):
 
 def test_14_crops(field, splat):
     labelled = kfgs.transfer_labels(field, splat)
-    chairs = labelled[OfClass("chair").select(labelled)]
+    chairs = labelled[OfClass("chair")]
     assert set(chairs.labels.tolist()) == {labelled.names.index("chair")}
+    assert len(field[OfClass("chair")]) == int((field.label().labels == field.names.index("chair")).sum())
+    assert len(kfgs.Remove(labelled.labels == chairs.labels[0]).apply(labelled)) == len(labelled) - len(chairs)
     low, high = field.gaussians.means.amin(0).tolist(), field.gaussians.means.mean(0).tolist()
     inside = InBox(low, high).select(field)
     assert 0 < len(inside) < len(field)
-    for which in (inside, inside.mask, inside.indices):
+    for which in (inside, inside.mask, inside.indices, InBox(low, high)):
         assert len(field[which]) == len(field.select(which)) == len(field.gaussians[which]) == len(inside)
     assert len(splat[labelled.labels >= 0]) <= len(splat)
-    for which in ("chair", OfClass("chair"), InBox(low, high)):
-        refused(lambda which=which: splat[which], "which:", "OfClass('chair').select(cloud)", error=TypeError)
+    refused(lambda: splat["chair"], "which:", "pass a rule like OfClass('chair')", error=TypeError)
+    refused(lambda: splat[OfClass("chair")], "gaussians.labels:", "attach a field")
 
 
 def test_15_a_field_of_my_own_gaussians_and_features(splat):
@@ -155,7 +157,7 @@ def test_15_a_field_of_my_own_gaussians_and_features(splat):
     assert field.query(features[0], score="cosine").scores[0] > 0.99
 
 
-HELD = ("class", "label", "score", "feature", "opacity", "chair", None)
+HELD = ("class", "label", "score", "feature", "opacity", "chair", OfClass("chair"), None)
 
 
 @pytest.mark.parametrize("color_by", HELD)

@@ -87,7 +87,7 @@ def label_set_from_examples(field: SemanticField, examples: Mapping[str, Example
 def _direction(field: SemanticField, example: Example, name: str) -> Tensor:  # [D] of length 1
     """The mean direction of the features of one example."""
     if isinstance(example, Selection | Tensor):
-        features = field.features_of(as_rows(name, example, len(field)))
+        features = field.features_of(as_rows(name, example, field))
     else:
         camera = view_named(field.cameras, example.view, name)
         pixels, rendering = _pixels(camera, example, name), field.render(camera)

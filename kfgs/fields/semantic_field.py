@@ -126,7 +126,7 @@ class SemanticField:
 
     def select(self, which: Any) -> SemanticField:
         """A field of some of its Gaussians, with all that is known about them. Rows and errors: see `Gaussians.select`."""
-        rows = as_rows("which", which, len(self))
+        rows = as_rows("which", which, self)
         fused = None if self.fused is None else self.fused.select(rows)
         return replace(self, gaussians=self.gaussians.select(rows), fused=fused)
 
@@ -160,7 +160,7 @@ class SemanticField:
 
     def features_of(self, rows: Any) -> Tensor:  # [n, D]
         """The features of some Gaussians, all-zero if unknown. Rows and errors: see `Gaussians.select`."""
-        latents = self._source.latents[as_rows("rows", rows, len(self)).to(self.latents.device)]
+        latents = self._source.latents[as_rows("rows", rows, self).to(self.latents.device)]
         return self._source.decode(latents) * latents.any(dim=1)[:, None]
 
     def classify(self, classes: Classes | None = None) -> Classification:

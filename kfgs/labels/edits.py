@@ -20,18 +20,7 @@ from ..cameras.similarity import Similarity
 from ..gaussians import Gaussians
 from ..splat.transform import transform_gaussians
 from .color import Mode, parse_color, recolor
-from .selection import (
-    KINDS,
-    OfClass,
-    OfIndex,
-    Rule,
-    Selection,
-    class_names,
-    plain_fields,
-    read_object,
-    set_fields,
-    three_numbers,
-)
+from .selection import Rule, Selection, as_rule, class_names, plain_fields, set_fields, three_numbers
 from .transfer import as_cloud
 
 AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
@@ -64,7 +53,7 @@ class OnSelection(Edit):
         rules = where if isinstance(where, list | tuple) else [where]
         if not rules:
             raise ValueError("where: expected at least one rule, got none; name a class, or give OfClass('chair')")
-        set_fields(self, where=tuple(_rule(rule) for rule in rules))
+        set_fields(self, where=tuple(as_rule(rule, "where") for rule in rules))
 
     def apply(self, gaussians: Gaussians) -> Gaussians:
         """See `Edit.apply`."""
@@ -79,18 +68,6 @@ class OnSelection(Edit):
     @abstractmethod
     def _change(self, gaussians: Gaussians, mask: Tensor) -> Gaussians:  # mask: [N] bool, of some Gaussians
         """The edited cloud."""
-
-
-def _rule(where: Any) -> Rule:
-    if isinstance(where, str):
-        return OfClass(where)
-    if isinstance(where, Selection):
-        return OfIndex(tuple(where.indices.tolist()))
-    if isinstance(where, dict):
-        return read_object("where", where, KINDS, "kind")
-    if not isinstance(where, Rule):
-        raise TypeError(f"where: expected a class name, a Selection or a rule like OfClass, got {where!r:.80}")
-    return where
 
 
 def _present(gaussians: Gaussians) -> str:

@@ -17,7 +17,7 @@ from ..cameras import Camera
 from ..gaussians import Gaussians
 from ..splat.views import sum_pixels
 from .components import number_parts
-from .selection import OfClass, Rule, Selection
+from .selection import as_selection
 from .transfer import as_cloud
 
 LONGEST = 160  # longer side in pixels of the views compared; on room_0 shares change by at most 0.3 % of the picture
@@ -141,9 +141,7 @@ def connected_parts(
         most: the most parts to return.
     """
     gaussians = as_cloud(gaussians)
-    rule = OfClass(selection) if isinstance(selection, str) else selection
-    rule = rule.select(gaussians) if isinstance(rule, Rule) else rule
-    selection = rule if isinstance(rule, Selection) else Selection.of(rule)
+    selection = as_selection(selection, gaussians)
     check_shapes(("gaussians.means", gaussians.means, "N 3"), ("selection.mask", selection.mask, "N"))
     check_whole("most", most, 1)
     if distance is not None:

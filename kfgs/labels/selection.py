@@ -1,7 +1,7 @@
 """Selections of Gaussians: from cosines with a query (Sec. 3.4), or by rules: class, index, box or sphere.
 
 A `Selection` holds for one cloud. A rule works on any: `OfClass("chair").select(gaussians)` is a `Selection`. Edits hold rules,
-and JSON can.
+and JSON can. `as_selection` takes whatever a person holds.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar, get_args
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -177,6 +178,8 @@ class Rule(ABC):
         """Apply the rule to Gaussians or a field; a ValueError if the cloud lacks the labels, class or index that it needs."""
         return Selection.of(*self._find(as_cloud(gaussians)))
 
+    __call__ = select  # so that `gaussians[rule]` works
+
     @abstractmethod
     def _find(self, gaussians: Gaussians) -> tuple[Tensor, str]:
         """The mask [N] of what is selected, and the rule in words."""
@@ -299,6 +302,25 @@ def class_names(gaussians: Gaussians) -> tuple[str, ...]:
 
 
 KINDS: dict[str, type[Rule]] = {kind.kind: kind for kind in (OfClass, InBox, InSphere, OfIndex)}
+
+
+def as_selection(value: Any, gaussians: Gaussians, name: str = "selection") -> Selection:
+    """What a person holds as a selection: a class name, a rule, a `Selection`, or a mask [N] of these Gaussians."""
+    if isinstance(value, Tensor | np.ndarray | list):
+        return Selection.of(as_tensor(name, value))
+    return value if isinstance(value, Selection) else as_rule(value, name).select(gaussians)
+
+
+def as_rule(value: Any, name: str) -> Rule:
+    """What a person holds as a rule: as for `as_selection`, or a rule in JSON. Of a `Selection` or a mask, the indices."""
+    if isinstance(value, Selection | Tensor | np.ndarray):
+        value = value if isinstance(value, Selection) else Selection.of(value)
+        return OfIndex(tuple(value.indices.tolist()))
+    if isinstance(value, dict):
+        return read_object(name, value, KINDS, "kind")
+    if not isinstance(value, str | Rule):
+        raise TypeError(f"{name}: expected a class name, a rule like OfClass, a Selection or a mask, got {value!r:.80}")
+    return OfClass(value) if isinstance(value, str) else value
 
 
 def _points(gaussians: Gaussians) -> Tensor:  # [N, 3] float64, in the world

@@ -11,13 +11,13 @@ import torch
 from traitlets import Any as Anything
 from traitlets import Float, HasTraits, Unicode, observe, validate
 
-from .._check import as_tensor, check_choice, check_whole, class_indices
+from .._check import check_choice, check_whole, class_indices
 from ..cameras import Camera
 from ..gaussians import Gaussians
 from ..labels import EditList, Selection
 from ..labels.edit_list import read_edits
 from ..labels.edits import Edit
-from ..labels.selection import Rule
+from ..labels.selection import as_selection
 from .pack import pack_camera
 from .session import EDITS, labelled
 from .state import Exploration, Picked, Side
@@ -43,8 +43,9 @@ class Shared(HasTraits):
     side = Unicode()
     """The cloud that is shown, and that `selection` and `edits` are of: "semantic" or "color"."""
     selection = Anything()
-    """A `Selection` of the Gaussians as they were given, without those that an edit removed. A mask [N], a rule like `InBox`
-    or None can be set, too; of another length than the cloud shown, it is of the other one, which is shown then."""
+    """A `Selection` of the Gaussians as they were given, without those that an edit removed. A class name, a
+    rule like `InBox`, a mask [N] or None can be set, too; of another length than the cloud shown, it is of the other one, which
+    is shown then."""
     edits = Anything(EditList())
     """The `EditList` of the cloud that is shown: `viewer.edits.apply(splat)`."""
     picked = Anything(None)
@@ -105,9 +106,8 @@ class Shared(HasTraits):
             return state.describe(self.side, value)
         if name == "edits" and not isinstance(value, EditList):
             return EditList(value or ())
-        if name == "selection" and not isinstance(value, Selection):
-            cloud = labelled(state, self.side)
-            return value.select(cloud) if isinstance(value, Rule) else Selection.of(as_tensor("selection", value))
+        if name == "selection":
+            return as_selection(value, labelled(state, self.side))
         return value
 
     @observe(*NAMES)

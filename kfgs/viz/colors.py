@@ -13,7 +13,7 @@ from .._card import short_repr
 from .._check import as_array, as_tensor, check_choice, check_range, check_shapes
 from ..gaussians import Gaussians
 from ..labels import OfClass, Selection
-from ..labels.selection import class_names
+from ..labels.selection import Rule, as_selection, class_names
 from ..splat.sh import sh0_to_rgb
 from .palette import UNLABELLED, palette
 from .pictures import Array, as_bytes
@@ -22,7 +22,7 @@ SOURCES = {
     "label": "labels", "class": "labels", "score": "scores", "rgb": "sh", "view": "sh", "feature": "features",
     "opacity": "opacities",
 }  # fmt: skip
-ColorBy = str | Selection | Tensor | Array | None
+ColorBy = str | Selection | Rule | Tensor | Array | None
 COLORMAP = "cividis"  # brightness rises evenly; looks the same to colour-blind eyes
 
 
@@ -104,7 +104,7 @@ def cloud_colors(
     if color_by is None:
         parts = {"label": gaussians.labels, "rgb": gaussians.sh, "feature": gaussians.features}
         color_by = next((name for name, values in parts.items() if values is not None), "opacity")
-    color_by = color_by.scores if isinstance(color_by, Selection) else color_by
+    color_by = as_selection(color_by, gaussians).scores if isinstance(color_by, Selection | Rule) else color_by
     if isinstance(color_by, str):
         names = class_names(gaussians)
         check_choice("color_by", color_by, (*SOURCES, *names))

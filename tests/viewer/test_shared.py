@@ -83,15 +83,16 @@ def test_a_selection_is_a_mask_a_rule_or_an_answer_of_either_cloud(viewer):
     viewer.selection = mask
     assert viewer.selection.mask.equal(mask)
     assert base64.b64decode(viewer.wire["sides"]["color"]["selected"]) == base64.b64decode(bits(mask))
-    viewer.selection = OfClass("chair")
-    assert viewer.selection.mask.tolist() == (state.labels("color") == 1).tolist()
+    for chairs in ("chair", OfClass("chair")):
+        viewer.selection = chairs
+        assert viewer.selection.mask.tolist() == (state.labels("color") == 1).tolist()
     viewer.selection = Selection.of(state.cloud("semantic").labels == 2)  # of the semantic cloud, by its length
     assert (viewer.side, len(viewer.selection)) == ("semantic", 60)
     assert viewer.wire["sides"]["color"]["selected"] is None
     viewer.selection = None
     assert (len(viewer.selection), viewer.question) == (0, None)
     before = viewer.wire
-    for wrong in (torch.ones(3, dtype=torch.bool), OfClass("lamp"), torch.ones(450)):
+    for wrong in (torch.ones(3, dtype=torch.bool), OfClass("lamp"), "lamp", torch.ones(450)):
         with pytest.raises((ValueError, TypeError)):
             viewer.selection = wrong
     assert viewer.wire == before

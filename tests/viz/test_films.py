@@ -8,7 +8,7 @@ import torch
 from cases_clouds import balls
 from cases_viz import C0
 from messages import refused, tells
-from PIL import Image
+from PIL import Image, ImageSequence
 
 from kfgs.cameras import Camera
 from kfgs.viz import palette, save_animation, show_cloud
@@ -58,11 +58,7 @@ def shade(camera):
 
 def frames_of(path):
     with Image.open(path) as film:
-        frames = []
-        for number in range(film.n_frames):
-            film.seek(number)
-            frames.append(np.asarray(film.convert("RGB")))
-        return frames, film.info
+        return [np.asarray(frame.convert("RGB")) for frame in ImageSequence.Iterator(film)], film.info
 
 
 def test_a_gif_holds_the_frames_their_time_and_repeats(tmp_path):
