@@ -42,8 +42,9 @@ def plotter():
 
 
 def test_1_cameras_and_photos_of_a_scene(scene):
-    for i, camera in enumerate(scene.cameras):
-        assert scene.image(i).shape == (*camera.size, 3)
+    assert [scene[name] for name in ("view_000.png", "view_000")] == scene[:1] * 2
+    for camera in scene:
+        assert scene.image(camera.name).shape == scene.image(camera).shape == (*camera.size, 3)
         assert camera.R.shape == (3, 3)
         assert torch.allclose(camera.R @ camera.center + camera.t, torch.zeros(3), atol=1e-5)
         assert torch.allclose(camera.c2w[:3, 3], camera.center, atol=1e-5)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -22,6 +23,7 @@ ROTATION_TOLERANCE = 1e-3  # of R R^T: matrices from text files have few digits
 NEAR = 0.2
 """World units: the smallest depth that 3DGS draws, meant for scenes of metres."""
 UP = (0.0, 0.0, 1.0)  # in the world, by default
+_names = functools.lru_cache(8)(functools.partial(Names, bare=True))  # of views: many are looked up one after the other
 
 
 @dataclass(frozen=True)
@@ -218,9 +220,8 @@ def view_named(cameras: Sequence[Camera], view: str | Camera, where: str) -> Cam
     """The one camera of a name, with or without its ending; a camera is itself. Errors begin with `where`."""
     if isinstance(view, Camera):
         return view
-    named = {camera.name: camera for camera in cameras}
-    names = Names(named, bare=True)
+    names = _names(tuple(camera.name for camera in cameras))
     if (name := names.find(view)) is None:
-        some = ", ".join([*list(named)[:3], "..."])
-        raise ValueError(f"{where}: expected the name of a training view ({some}), got {view!r}; {names.advice(view)}")
-    return named[name]
+        some = ", ".join([*list(names.names)[:3], "..."])
+        raise ValueError(f"{where}: expected the name of a view ({some}), got {view!r}; {names.advice(view)}")
+    return next(camera for camera in cameras if camera.name == name)

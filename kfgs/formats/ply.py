@@ -105,6 +105,11 @@ def write_ply_elements(path: str | Path, elements: dict[str, Columns], *, commen
             rows.tofile(file)
 
 
+def to_number(word: str) -> float:
+    """A number of a text file; NaN for what Windows writes for NaN and infinity: `-nan(ind)`, `1.#QNAN`."""
+    return float(NAN.sub("nan", word))
+
+
 def stack_columns(columns: Columns, names: list[str]) -> Tensor:  # [N, len(names)] float32
     """Some columns side by side."""
     with np.errstate(over="ignore"):  # of doubles; `read_splats` leaves them out

@@ -24,8 +24,9 @@ from scipy.spatial.transform import Rotation
 from .._files import as_path, text_encoding
 from .._notes import Repair
 from ..cameras.camera import ROTATION_TOLERANCE
+from ..formats.ply import to_number
 from .files import MAX_NUMBER, MAX_SIDE, SceneError, is_inside, some
-from .posed import Matrix, to_number
+from .posed import Matrix
 
 FILES = ("cameras", "images", "points3D")
 # The models in the order of COLMAP's ids, with their parameters. Those that begin with f are focal lengths.

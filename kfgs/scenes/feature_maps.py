@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from .._arrays import read_array, read_safetensors, reading
-from .._files import Names, as_path
+from .._files import Names, as_path, file_stem
 from .._rows import EPS, row_norms
 from ..cameras.resample import fits_aspect
 from ..quant.maps import grid_slices
@@ -89,9 +89,8 @@ class FeatureFolder(Sequence[Tensor]):
     def of(self, scene: Scene, split: Split = "train") -> FeatureFolder:
         """The maps of some views of a scene: of a split, of `all`, or of a list of view names or indices."""
         check_is_scene(scene)
-        chosen = scene.select(split)
-        stems, sizes = [chosen.stem(i) for i in range(len(chosen))], [camera.size for camera in chosen.cameras]
-        return FeatureFolder(self.path, stems, channels=self.channels, sizes=sizes)
+        sizes = {file_stem(camera.name): camera.size for camera in scene.select(split)}
+        return FeatureFolder(self.path, list(sizes), channels=self.channels, sizes=list(sizes.values()))
 
     def __len__(self) -> int:
         return len(self.stems)
@@ -214,8 +213,7 @@ class FeatureFolder(Sequence[Tensor]):
         """
         sizes = dict(zip(self.stems, self.sizes, strict=True))
         if scene is not None:
-            chosen = scene.select(split)
-            sizes = {chosen.stem(i): camera.size for i, camera in enumerate(chosen.cameras)}
+            sizes = {file_stem(camera.name): camera.size for camera in scene.select(split)}
         files, shapes, turned = self._find(list(sizes)), dict[str, tuple[int, ...]](), dict[str, str]()
         problems = {stem: "expected its map, got none" for stem in sizes if stem not in files}
         for stem, file in files.items():

@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import re
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path, PurePosixPath
 
@@ -66,11 +66,10 @@ def list_images(folder: str | Path, suffixes: tuple[str, ...] = IMAGE_SUFFIXES) 
     return sorted(names, key=natural_key)
 
 
-def find_pictures(folder: Path, names: Iterable[str]) -> dict[str, Path]:
+def find_pictures(folder: Path, names: Sequence[str]) -> dict[str, Path]:
     """The file of each name in a folder, as far as there is one: of this name, or the one that `Names` finds in its images."""
-    wanted = list(names)
-    files = {name: folder / name for name in wanted if os.path.isfile(folder / name)}
-    lost = [name for name in wanted if name not in files]
+    files = {name: folder / name for name in names if os.path.isfile(folder / name)}
+    lost = [name for name in names if name not in files]
     if lost:
         others = Names(name for name in list_images(folder) if name not in files)
         pairs = [(name, file) for name in reversed(lost) if (file := others.find(name)) is not None]
@@ -88,7 +87,6 @@ def read_image(path: str | Path, background: str = "white") -> Tensor:  # [H, W,
     refuses some of these. A SceneError if the file cannot be decoded, or has too many pixels for its size.
     """
     with open_picture(path, small=COLORS) as picture:
-        picture.getexif().pop(ORIENTATION, None)  # Pillow would turn a TIFF
         if picture.mode.startswith(("I", "F")):
             if "transparency" in picture.info:
                 raise ValueError("one of its 16-bit grey values is transparent: save it with an alpha channel")
@@ -108,7 +106,6 @@ def read_alpha(path: Path) -> Tensor | None:  # [H, W] float32 in [0, 1]
     if not os.path.isfile(path):
         return None
     with open_picture(path, small=COLORS) as picture:
-        picture.getexif().pop(ORIENTATION, None)
         alpha = np.array(picture.convert("RGBA").getchannel("A")) if _may_be_clear(picture) else np.array([255])
         return None if alpha.min() == 255 else torch.from_numpy(alpha).float().div_(255)
 
@@ -141,6 +138,8 @@ def open_picture(
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # our limits come next
             picture = Image.open(path)
         with picture:
+            if picture.format == "TIFF":  # Pillow would turn it
+                picture.getexif().pop(ORIENTATION, None)
             width, height = picture.size
             if width * height > min(PIXELS, max(small, PACKED * path.stat().st_size)):
                 raise ValueError(f"{width}x{height} pixels in {path.stat().st_size} bytes are too many to be one")
@@ -172,7 +171,6 @@ def read_mask(path: Path, size: tuple[int, int]) -> Tensor:  # [H, W] bool
     the photo, a pixel counts if all of it does.
     """
     with open_picture(path, "a mask of a photo", "write it again", small=max(SMALL, size[0] * size[1])) as picture:
-        picture.getexif().pop(ORIENTATION, None)
         check_mask(path, picture.size, size)
         if picture.mode in ("1", "L") or picture.mode.startswith(("I", "F")):
             bright = np.asarray(picture)

@@ -63,8 +63,8 @@ def load_scene(
         images = root / images
     scene = replace(_load_views(path, model, None if images is None else as_path(images)), folder=root)
     if scene.masks is None:  # its file names none
-        names = [camera.name for camera in scene.cameras]
-        masks, notes = folder_masks(names, picture_folder(names[0], scene.image_paths[0]), root)
+        pictures = picture_folder(scene[0].name, scene.image_paths[0])
+        masks, notes = folder_masks([camera.name for camera in scene], pictures, root)
         scene = replace(scene, masks=masks, notes=(*scene.notes, *notes))
     for mask, camera in zip(scene.masks or (), scene.cameras, strict=scene.masks is not None):
         if mask is not None:

@@ -20,7 +20,7 @@ from .._origin import ORIGIN, choose_origin, describe_origin, recounted
 from ..cameras.camera import ROTATION_TOLERANCE, Camera, Distortion
 from ..cameras.projection import unproject_depth
 from ..cameras.resample import fits_aspect
-from ..formats.ply import NAN, points_from_columns, read_ply
+from ..formats.ply import points_from_columns, read_ply, to_number
 from . import files
 from .files import MAX_NUMBER, SceneError, natural_key, picture_size, some
 from .scene import Scene
@@ -139,11 +139,6 @@ def scene_of_poses(
     with files.scene_error(f"{path}: "):  # names that do not differ
         scene = Scene(local, paths, recounted(places, ORIGIN, origin).float(), colors, splits, tuple(told))
     return replace(scene.with_near(), masks=masks if any(masks) else None)
-
-
-def to_number(word: str) -> float:
-    """A number of a text file; NaN for what Windows writes for NaN and infinity: `-nan(ind)`, `1.#QNAN`."""
-    return float(NAN.sub("nan", word))
 
 
 def read_numbers(path: Path, expected: str, columns: int, rows: int | None = None) -> Matrix:  # [rows, columns]

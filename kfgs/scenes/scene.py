@@ -15,7 +15,7 @@ from torch import Tensor
 from .._card import html_card
 from .._check import ORIGIN, check_choice, check_shapes
 from .._files import Names, file_stem, read_json, read_text
-from ..cameras.camera import NEAR, Camera
+from ..cameras.camera import NEAR, Camera, view_named
 from ..cameras.paths import camera_extent
 from ..cameras.resample import undistort
 from .files import SceneError, read_alpha, read_image, read_mask, scene_error, shrink_mask, some
@@ -28,10 +28,11 @@ SCANNETPP = "train_test_lists.json"
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
+class Scene(Sequence[Camera]):
     """V posed views of one place. Images are read from disk at each access.
 
-    `scene.select("train").cameras` and `.image_paths` belong to one split; `scene.image(i)` is a picture.
+    `scene["f01"]` is the camera of a view, `scene.image("f01")` its picture; both also take the view's index. `for camera in
+    scene` goes through all, `scene.select("train")` is the scene of one split.
 
     **Convention**: world to camera, pixel centres on halves (`Camera`), world units of the file. Loaders put the views in
     natural order of their names.
@@ -78,6 +79,18 @@ class Scene:
     def __len__(self) -> int:
         return len(self.cameras)
 
+    def __getitem__(self, view: int | str | slice) -> Any:
+        """The camera of a view, by its name or index as in `index`; of a slice, a list."""
+        return self.cameras[view if isinstance(view, slice) else self.index(view)]
+
+    def index(self, view: int | str | Camera) -> int:  # type: ignore[override]  # that of a list has a start and an end
+        """The index of a view from its name (with or without folder and suffix), camera or index; errors offer the nearest."""
+        if isinstance(view, str | Camera):
+            return self.cameras.index(view_named(self.cameras, getattr(view, "name", view), "view"))
+        if not -len(self) <= index(view) < len(self):
+            raise IndexError(f"view: expected a name or an index below {len(self)} (the number of views), got {view!r}")
+        return range(len(self))[index(view)]
+
     @property
     def origin(self) -> tuple[float, float, float]:
         """The place in the world that cameras and points are counted from, in float64; (0, 0, 0) unless they are far from it."""
@@ -112,11 +125,13 @@ class Scene:
             return list(range(len(self)))
         if not self.splits.get(split):
             named = "".join(f"{name}, " for name, views in self.splits.items() if views and name != "all")
-            raise ValueError(f"split: expected one of {named}all, got {split!r}; list its views in split.json")
+            advice = f"list its views in split.json (names of views are given as a list: [{split!r}])"
+            raise ValueError(f"split: expected one of {named}all, got {split!r}; {advice}")
         return self.splits[split]
 
-    def image(self, i: int) -> Tensor:  # [H, W, 3] in [0, 1]
-        """Read the picture of view `i`; in an undistorted scene the lens is removed on the way. Transparent pixels are black."""
+    def image(self, view: int | str | Camera) -> Tensor:  # [H, W, 3] in [0, 1]
+        """Read the picture of a view; in an undistorted scene the lens is removed on the way. Transparent pixels are black."""
+        i = self.index(view)
         lens = (self.lenses or self.cameras)[i]
         image = read_image(self.image_paths[i], "black")
         if image.shape[:2] != lens.size:
@@ -124,8 +139,9 @@ class Scene:
             raise SceneError(f"{self.image_paths[i]}: expected {expected}; replace it by a copy of that size")
         return image if self.lenses is None else undistort(image, lens)[0]
 
-    def mask(self, i: int) -> Tensor:  # [H, W] bool
-        """Which pixels of view `i` count: not those that are black in its mask, nor those beyond an undistorted picture."""
+    def mask(self, view: int | str | Camera) -> Tensor:  # [H, W] bool
+        """Which pixels of a view count: not those that are black in its mask, nor those beyond an undistorted picture."""
+        i = self.index(view)
         lens = (self.lenses or self.cameras)[i]
         path = None if self.masks is None else self.masks[i]
         mask = torch.ones(lens.size, dtype=torch.bool) if path is None else read_mask(path, lens.size)
@@ -190,16 +206,8 @@ class Scene:
         Args:
             which: the name of a split, or "all" (see `views`); or names of views (with or without suffix), or their indices.
         """
-        if isinstance(which, str):
-            which = self.views(which)
-        place = {camera.name: i for i, camera in enumerate(self.cameras)}
-        names, indices = Names(place, bare=True), list[int]()
-        for view in which:
-            i = place.get(names.find(view) or "", -1) if isinstance(view, str) else index(view)  # also torch's integers
-            if not 0 <= i < len(self):
-                advice = names.advice(view) if isinstance(view, str) else f"names are like {self.cameras[0].name!r}"
-                raise ValueError(f"which: expected names or indices of the {len(self)} views, got {view!r}; {advice}")
-            indices.append(i)
+        views = self.views(which) if isinstance(which, str) else which
+        indices = [self.index(view) for view in views]
         position = {view: n for n, view in enumerate(indices)}
         if len(position) != len(indices):
             raise ValueError("which: expected each view once, got one twice; remove the repetition")

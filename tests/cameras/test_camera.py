@@ -159,7 +159,7 @@ def test_points_and_pictures_may_be_arrays():
 
 def test_an_unknown_name_does_not_mean_the_view_without_a_name():
     nameless = Camera(torch.eye(4), K, 96, 64)
-    refused(lambda: view_named([nameless], "b", "examples"), "examples:", "training view", "got 'b'")
+    refused(lambda: view_named([nameless], "b", "examples"), "examples:", "name of a view", "got 'b'")
 
 
 def test_a_camera_has_what_others_call_its_parts():

@@ -6,6 +6,7 @@ import pytest
 import torch
 from colmap_models import write_picture
 from messages import refused, tells
+from PIL import Image
 
 from kfgs.cameras import Camera, Distortion
 from kfgs.cameras.resample import undistort
@@ -91,14 +92,26 @@ def test_select_by_split_name_stem_and_index(tmp_path: Path) -> None:
     for order in (range(1, 3), torch.tensor([1, 2]), np.array([1, 2])):
         assert scene.select(order).splits == {"train": [0], "test": [1]}
     for which, message in (
-        ("val", ("split:", "train, test, all", "got 'val'", "list")),
-        (["rgb_1"], ("which:", "got 'rgb_1'", "did you mean 'rgb_10.png'?")),
-        ([3], ("which:", "3 views", "got 3")),
-        ([-1], ("which:", "3 views", "got -1")),
+        ("rgb_10", ("split:", "train, test, all", "got 'rgb_10'", "split.json", "['rgb_10']")),
+        (["rgb_1"], ("view:", "got 'rgb_1'", "did you mean 'rgb_10.png'?")),
         ([1, 1], ("which:", "once", "got one twice")),
+        ([2, -1], ("which:", "once", "got one twice")),
     ):
-        with pytest.raises(ValueError, match=tells(*message)):
-            scene.select(which)  # type: ignore[arg-type]
+        refused(lambda which=which: scene.select(which), *message)  # type: ignore[misc]
+
+
+def test_a_view_is_its_name_its_camera_or_its_index(tmp_path: Path) -> None:
+    scene = _scene(tmp_path)
+    Image.new("RGB", (64, 48), "red").save(scene.image_paths[2])
+    assert [*scene, *scene[:2]] == [*scene.cameras, *scene.cameras[:2]]
+    for view in ("rgb_10", "rgb_10.png", "x/RGB_10.jpg", 2, -1, np.int64(2), torch.tensor(2), scene.cameras[2]):
+        assert scene.index(view) == 2
+        assert scene.image(view)[0, 0].tolist() == [1, 0, 0]
+        assert scene.mask(view).all()
+    assert scene["rgb_10"] is scene[-1] is scene.cameras[2]
+    for wrong in (3, -4):
+        refused(lambda wrong=wrong: scene[wrong], "view:", "3 (the number of views)", f"got {wrong}", error=IndexError)  # type: ignore[misc]
+    refused(lambda: scene.image("rgb_2"), "view:", "rgb_0.png, rgb_5.png", "got 'rgb_2'", "did you mean")
 
 
 def test_scenes_are_checked(tmp_path: Path) -> None:

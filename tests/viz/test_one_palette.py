@@ -27,13 +27,8 @@ from kfgs.viz import (
     to_pyvista,
 )
 
-NAMES = (
-    "wall",
-    "floor",
-    "chair",
-    "sofa",
-    "lamp",
-)  # by number, a chair would have the floor's brown, the sofa's blue ...
+# by number, a chair would have the floor's brown, the sofa's blue ...
+NAMES = ("wall", "floor", "chair", "sofa", "lamp")
 CLOUD = some_gaussians().replace(names=NAMES)
 CHAIR = NAMES.index("chair")
 MAP = torch.full((20, 20), CHAIR)

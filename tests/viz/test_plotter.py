@@ -77,14 +77,11 @@ def test_draw_view_is_a_plotter_that_looks_through_the_camera_and_is_closed():
     assert [window.render_window for window in used] == [None, None]
 
 
-def test_pyvistas_theme_is_kept():
+def test_pyvistas_theme_is_kept(monkeypatch):
     if trouble():
         pytest.skip(trouble())
-    dark = pv.themes.DarkTheme()
-    before, pv.global_theme.background = pv.global_theme.background, dark.background
-    try:
-        assert make_plotter(8, 8, off_screen=True).background_color == dark.background
-        assert make_plotter(8, 8, off_screen=True, background="red").background_color == "red"
-    finally:
-        pv.global_theme.background = before
-        pv.close_all()
+    dark = pv.themes.DarkTheme().background
+    monkeypatch.setattr(pv.global_theme, "background", dark)
+    assert make_plotter(8, 8, off_screen=True).background_color == dark
+    assert make_plotter(8, 8, off_screen=True, background="red").background_color == "red"
+    pv.close_all()
