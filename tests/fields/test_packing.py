@@ -11,7 +11,7 @@ import safetensors.torch
 import torch
 import zstandard
 from cases_packed import LOSSY, METHODS, assert_same, assert_same_notes, assert_within, field
-from messages import refused, tells
+from messages import refused
 
 from kfgs.fields import SemanticField
 from kfgs.fields.packing import SMALL
@@ -103,8 +103,7 @@ def test_saving_replaces_an_older_field_and_nothing_else(tmp_path):
         ({"opacities": torch.full((40,), 1.5)}, "gaussians.opacities:"),
         ({"scales": torch.full((40, 3), 3.4e38)}, "gaussians.scales:"),
     ):
-        with pytest.raises(ValueError, match=tells(name, "finite numbers from")):
-            field(n=40, **changes).save(path, "small")
+        refused(lambda changes=changes: field(n=40, **changes).save(path, "small"), name, "finite numbers from")
     refused(lambda: replace(field(), info={"loss": float("nan")}).save(path), "info:", "got Out")
     refused(lambda: field().save(path, "coarse"), "precision:", "fine", "'coarse'")
     assert path.read_bytes() == whole
@@ -122,8 +121,7 @@ def test_a_precision_of_your_own_is_kept_under_its_own_name(round_trip):
     assert back.info["rounded"][0]["errors"]["gaussians.quats"] == 0.01
     assert [entry["precision"] for entry in round_trip(back, "tiny").info["rounded"]] == ["custom", "tiny"]
     for changes in ({"means": 0}, {"degrees": 31}, {"latents": float("nan")}):
-        with pytest.raises(ValueError, match=tells(next(iter(changes)), "expected a number")):
-            replace(SMALL, **changes)
+        refused(lambda changes=changes: replace(SMALL, **changes), next(iter(changes)), "expected a number")
 
 
 def test_a_run_folder_is_opened_by_its_field(tmp_path):

@@ -186,8 +186,7 @@ def test_bad_input_is_refused_before_any_work(scene, room, maps, splat, tmp_path
         ((scene, ["a.npy"]), TypeError, ("maps[0]", "str")),
         ((scene, maps, "paper"), TypeError, ("method:", "Paper()", "str")),
     ):
-        with pytest.raises(error, match=tells(*words)):
-            fit(*arguments, folder=tmp_path)
+        refused(lambda arguments=arguments: fit(*arguments, folder=tmp_path), *words, error=error)
     refused(lambda: fit(scene, maps, folder=tmp_path, split="val"), "split:", "train, test", "got 'val'")
     refused(lambda: Paper(codebook=None), "autoencoder:", "codebook=None")
     assert list(tmp_path.iterdir()) == []

@@ -78,12 +78,10 @@ def test_numbers_out_of_range():
     refused(lambda: made.set_gamma(0.5), "gamma:", "got none", "0.5")
     made.ask("chair")
     for gamma in (-0.1, 1.1, float("nan")):
-        with pytest.raises(ValueError, match=tells("gamma:", f"got {gamma}")):
-            made.set_gamma(gamma)
+        refused(lambda gamma=gamma: made.set_gamma(gamma), "gamma:", f"got {gamma}")
     assert made.gamma == 0.0
     for distance in (0.0, -1.0, float("inf"), float("nan")):
-        with pytest.raises(ValueError, match=tells("distance:", "(0, inf)", f"got {distance}")):
-            made.set_distance(distance)
+        refused(lambda distance=distance: made.set_distance(distance), "distance:", "(0, inf)", f"got {distance}")
     assert made.distance == 1.0
 
 
