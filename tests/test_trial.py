@@ -8,6 +8,7 @@ import pyvista as pv
 import torch
 from cases_viz import some_plotter
 from messages import refused
+from PIL import Image
 
 import kfgs
 from kfgs import viz
@@ -104,6 +105,17 @@ def test_9_a_label_map_with_a_legend(scene, field):
         viz.overlay_labels(scene.image(0), labels, n) for n in (field.names, field.classes, field, field.label())
     ]
     assert all((picture == pictures[0]).all() for picture in pictures)
+
+
+def test_the_depth_of_a_pixel_and_how_sure_its_class_is(scene, field, splat, desk):
+    for camera in scene.select("test"):
+        stem = camera.name.removesuffix(".png")
+        depth, labels = np.load(desk / f"scene/depth/{stem}.npy"), Image.open(desk / f"scene/labels/{stem}.png")
+        for drawn in (field.render(camera), kfgs.rasterize(splat, camera)):
+            assert np.median(np.abs(drawn.depth.numpy() - depth)) < 0.1  # of some 3 metres
+        ranked = field.rank(camera)
+        sure, right = ranked.scores[..., 0], ranked.labels[..., 0] == torch.from_numpy(np.array(labels))
+        assert sure[right].mean() > sure[~right].mean() + 0.1
 
 
 def test_10_a_film(field, splat, tmp_path):

@@ -17,6 +17,9 @@ from .engines.contract import Engine, Ranked
 from .engines.table import choose_projecting
 from .project import Projected, project
 from .tiles import bin_tiles
+from .views import divide_sums
+
+LAYERS = 32  # of `Rendering.depth`; 64 change it by less than 0.002 m
 
 
 class Rendering(NamedTuple):
@@ -25,6 +28,25 @@ class Rendering(NamedTuple):
     map: Tensor  # [H, W, D] features, or red, green, blue
     alpha: Tensor  # [H, W] opacity in [0, 1): 1 - transmittance
     projected: Projected  # the visible Gaussians on the image plane
+
+    @property
+    def depth(self) -> Tensor:  # [H, W]
+        """The median depth z of each pixel, world units: half of its opacity is nearer. 0 where nothing is drawn; no gradient.
+
+        The rendering weights are summed in 32 layers of equally many Gaussians; the layer where half is reached gives its mean
+        depth. On a colour field of the toy room half of the pixels are within 0.05 m (by the mean of all depths: 0.07 m).
+        """
+        seen, (height, width) = self.projected, self.alpha.shape
+        if not len(seen.depths):
+            return torch.zeros_like(self.alpha)
+        with torch.no_grad():
+            ends = seen.depths.sort().values[len(seen.depths) * torch.arange(1, LAYERS) // LAYERS]
+            layers = torch.nn.functional.one_hot(torch.bucketize(seen.depths, ends), LAYERS).to(seen.depths)
+            both = torch.cat([layers, layers * seen.depths[:, None]], dim=1)
+            tiles = bin_tiles(seen, width, height)
+            weights, sums = composite(seen.means2d, seen.conics, seen.opacities, both, tiles)[0].split(LAYERS, dim=-1)
+            half = (weights.cumsum(-1) < self.alpha[..., None] / 2).sum(-1, keepdim=True).clamp(max=LAYERS - 1)
+            return divide_sums(sums.gather(-1, half), weights.gather(-1, half))[..., 0]
 
     def to_numpy(self) -> np.ndarray[Any, Any]:  # [H, W, D]
         """The map as a NumPy array, from any device and without its gradient."""

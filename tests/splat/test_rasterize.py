@@ -1,5 +1,6 @@
 from types import SimpleNamespace
 
+import numpy as np
 import oracles_splat as oracle
 import pytest
 import torch
@@ -94,17 +95,29 @@ def test_gradients_of_colour_reach_harmonics_and_means():
     assert torch.autograd.gradcheck(render, inputs, fast_mode=True)
 
 
-def test_something_to_render_is_needed():
+@pytest.mark.parametrize("engine", ["reference", "auto"])
+def test_depth_is_that_of_the_gaussian_where_half_of_the_opacity_is_reached(engine):
     camera = a_camera()
-    with pytest.raises(ValueError, match=tells("gaussians:", "got neither", "gaussians.replace()")):
-        rasterize(gaussians_before(camera, 3, seed=0).replace(features=None), camera)
+    gaussians = gaussians_before(camera, 20, seed=4, spread=1.5)  # fewer than layers: each is exact
+    values = [v.numpy() for v in (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities)]
+    weights, alpha = oracle.render(*values, np.eye(20), camera.viewmat.numpy(), camera.K.numpy(), 24, 18)
+    z = (values[0] @ camera.viewmat.numpy()[:3, :3].T + camera.viewmat.numpy()[:3, 3])[:, 2]
+    order = z.argsort()
+    reached = weights[..., order].cumsum(axis=-1) >= alpha[..., None] / 2
+    rendering = rasterize(gaussians, camera, engine=engine)
+    expected = np.where(alpha > 0, z[order][reached.argmax(axis=-1)], 0)
+    np.testing.assert_allclose(rendering.depth.numpy(), expected, rtol=1e-9)
+    assert len(np.unique(expected)) > 8
+    assert not rasterize(gaussians[:0], camera).depth.any()
 
 
 def test_arguments_of_another_kind_and_mixed_types_are_named():
     camera = a_camera()
     gaussians = gaussians_before(camera, 4, seed=0)
-    with pytest.raises(TypeError, match=tells("gaussians", "SimpleNamespace", ".gaussians")):
-        rasterize(SimpleNamespace(gaussians=gaussians), camera)
+    nothing = gaussians.replace(features=None)
+    refused(lambda: rasterize(nothing, camera), "gaussians:", "got neither", "gaussians.replace()")
+    held = SimpleNamespace(gaussians=gaussians)
+    refused(lambda: rasterize(held, camera), "gaussians", "SimpleNamespace", ".gaussians", error=TypeError)
     refused(lambda: rasterize(gaussians, "view_0"), "camera", "str", "scene.cameras", error=TypeError)
     rendering = rasterize(gaussians.replace(features=gaussians.features.requires_grad_()), camera)
     assert torch.equal(torch.from_numpy(rendering.to_numpy()), rendering.map.detach())
