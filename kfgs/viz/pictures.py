@@ -119,7 +119,7 @@ def picture_grid(
 
     Args:
         rows: R rows of C pictures. Smaller ones stand in the middle of their row and column.
-        titles: C titles, or none.
+        titles: C titles, or none. Letters grow with the sheet: it is legible at the width of a page.
         width: width of each picture in pixels; all pictures are resized to it and to the proportions of the first in their
             row. Shrinking averages pixels. Enlarging repeats them, so that a coarse map looks coarse.
         names: the classes of the legend; () draws none.
@@ -146,9 +146,10 @@ def picture_grid(
             row[:] = [np.asarray(Image.fromarray(np.ascontiguousarray(p)).resize(size, Resampling.BOX)) for p in row]
     heights = [max(picture.shape[0] for picture in row) for row in pictures]
     width = max(picture.shape[1] for row in pictures for picture in row)
-    letters = max(12, width // 28)  # pixels
-    head = (letters * 3 // 2 if titles else 0) + GAP
     columns = len(rows[0])
+    fits = [int(100 * width / (ImageFont.load_default(size=100).getlength(title) or 1)) for title in titles]
+    letters = max(12, min([max(width // 28, columns * width // 48), *fits]))  # pixels
+    head = (letters * 3 // 2 if titles else 0) + GAP
     sheet = np.full((head + sum(heights) + len(rows) * GAP, GAP + columns * (width + GAP), 3), 255, np.uint8)
     for i, j in np.ndindex(len(rows), columns):
         picture = pictures[i][j]
@@ -159,9 +160,8 @@ def picture_grid(
     draw, font = ImageDraw.Draw(canvas), ImageFont.load_default(size=letters)
     for j, title in enumerate(titles):
         draw.text((GAP + j * (width + GAP) + width / 2, head / 2), title, fill=LEGEND_INK, font=font, anchor="mm")
-    drawn = [np.asarray(canvas)]
-    drawn += [draw_legend(np.arange(len(names)), names, width=drawn[0].shape[1])] if len(names) else []
-    return np.concatenate(drawn)
+    legend = [draw_legend(np.arange(len(names)), names, width=canvas.width)] if len(names) else []
+    return np.concatenate([np.asarray(canvas), *legend])
 
 
 def picture_sheet(pictures: Sequence[Array], titles: Sequence[str], columns: int, *, width: int | None = None) -> Array:
