@@ -5,7 +5,8 @@
 `N_name.py` is what is written and reviewed, `N_name.ipynb` is what people open: the same cells with their outputs. Both are
 committed, and tests/test_notebooks.py holds them in step. Each source runs from its first cell to its last (nbclient) in a
 fresh kernel of this Python, in the sources' own folder. It is refused if a cell fails, if anything is written to stderr
-(warnings are), if the executed file is larger than 1 MB, or if it shows no picture. What failed leaves no file behind.
+(warnings are), if the executed file is larger than 1 MB, or if it shows no picture. What failed leaves no file behind. A
+notebook that needs what is not there (example.py says so with a `MissingError`) is skipped, and its file stays.
 Pictures are kept as JPEG where that is smaller. `--out notebooks` renews the committed ones.
 """
 
@@ -37,6 +38,7 @@ LARGEST = 1_000_000  # bytes of an executed notebook: what a repository's web pa
 SECONDS = 600  # for one cell: six times what a whole notebook may take on two idle cores
 SUFFIXES = {"image/png": ".png", "image/jpeg": ".jpg", "image/gif": ".gif"}
 QUALITY = 85  # of JPEG
+MISSING = "MissingError"
 COLORS = re.compile(r"\x1b\[[0-9;]*m")  # of a terminal, in tracebacks
 
 
@@ -49,6 +51,7 @@ class Outcome:
     size: int = 0  # bytes of the executed file
     pictures: dict[str, bytes] = field(default_factory=dict)  # file name to content, in order of appearance
     problems: list[str] = field(default_factory=list)
+    skipped: str = ""  # what it needs and has not
 
 
 def find_sources(folder: Path, numbers: Sequence[int] = ()) -> list[Path]:
@@ -68,7 +71,6 @@ def find_sources(folder: Path, numbers: Sequence[int] = ()) -> list[Path]:
 def run_notebook(source: Path, out: Path, *, largest: int = LARGEST, seconds: int = SECONDS) -> Outcome:
     """Execute one source and write `out/<stem>.ipynb`, unless a cell fails: then no file of that name is left."""
     outcome, target = Outcome(source), out / f"{source.stem}.ipynb"
-    target.unlink(missing_ok=True)  # else an older run's would pass for this one's
     notebook = jupytext.read(source, fmt="py:percent")
     notebook.metadata = {
         "kernelspec": {"name": "python3", "display_name": "Python 3", "language": "python"},
@@ -79,6 +81,10 @@ def run_notebook(source: Path, out: Path, *, largest: int = LARGEST, seconds: in
     start = time.perf_counter()
     failure, below = _execute(notebook, source.parent, seconds)
     outcome.seconds = time.perf_counter() - start
+    if failure.startswith(MISSING):
+        outcome.skipped = failure
+        return outcome
+    target.unlink(missing_ok=True)  # else an older run's would pass for this one's
     outcome.problems = [failure] if failure else []
     outcome.problems += list(_noise(notebook))
     outcome.problems += [f"the kernel writes to stderr: {below}"] if below else []
@@ -126,6 +132,8 @@ def _execute_in(notebook: Any, folder: Path, seconds: int, *, home: str, stderr:
     try:
         client.execute(env=environment, stderr=stderr, cleanup_kc=True)
     except CellExecutionError as error:
+        if error.ename == MISSING:
+            return f"{MISSING}: {COLORS.sub('', error.evalue)}"
         where = _number(notebook, at[-1])
         return f"cell {where} fails: {error.ename}: {error.evalue}\n{_traceback(notebook, at[-1])}"
     except CellControlSignal as error:  # out of time
@@ -227,8 +235,9 @@ def main(arguments: Sequence[str] | None = None, say: Callable[[str], None] = pr
     for source in sources:
         outcome = run_notebook(source, options.out)
         facts = f"{outcome.seconds:6.1f} s  {outcome.size / 1000:5.0f} kB  {len(outcome.pictures):2d} pictures"
-        say(f"{source.stem:40s} {facts}  {'PROBLEM' if outcome.problems else 'ok'}")
-        for problem in outcome.problems:
+        verdict = "skipped" if outcome.skipped else "PROBLEM" if outcome.problems else "ok"
+        say(f"{source.stem:40s} {facts}  {verdict}")
+        for problem in [outcome.skipped] if outcome.skipped else outcome.problems:
             say("    " + problem.replace("\n", "\n    "))
         if options.pictures:
             _write_pictures(options.pictures, source.stem, outcome.pictures)

@@ -48,6 +48,6 @@ def test_two_threads_that_load_at_once_leave_the_flags_as_they_were(monkeypatch)
 
 @pytest.mark.skipif(find_spec("triton") is None, reason="triton is not installed")
 def test_triton_is_loaded_before_a_picture_is_drawn():
-    """If torch's optimisers load it after Mesa's LLVM and pycolmap, Python ends with a segfault (notebook 7)."""
+    """If torch's optimisers load it after Mesa's LLVM and pycolmap, Python ends with a segfault (notebook 6)."""
     code = "import sys; from kfgs import splat; splat.available_engines('cpu'); assert 'triton' in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)

@@ -1,5 +1,5 @@
 # %% [markdown]
-# # 1. A scene and its cameras
+# # 1. Cameras
 #
 # **Are my cameras right?** Everything in kfgs starts from photographs, the cameras that took them, and some points in
 # space. Wrong cameras spoil all that follows, so look at them first. You will see the photographs, the cameras in
@@ -8,15 +8,10 @@
 # About 10 seconds on two CPU cores (20 more to make the toy room the first time). Needs the extra `notebook`, no data.
 
 # %%
-# Your own data: a folder with images/ and a COLMAP model in sparse/0, or a transforms.json.
-import os
-from pathlib import Path
+# Your own data: folder = "my/scene", with images/ and a COLMAP model in sparse/0, or with a transforms.json.
+from example import make_room
 
-from kfgs import load_scene
-from kfgs.toy import ToyConfig, make_toy_room
-
-data = Path(os.environ.get("KFGS_NOTEBOOK_DATA", "data"))
-folder = make_toy_room(data / "room", ToyConfig(train_views=24, test_views=6))  # yours: folder = Path("my/scene")
+folder = make_room()
 
 # %% [markdown]
 # ## What a scene holds
@@ -27,7 +22,7 @@ folder = make_toy_room(data / "room", ToyConfig(train_views=24, test_views=6))  
 # %%
 from PIL import Image
 
-from kfgs import viz
+from kfgs import load_scene, viz
 
 scene = load_scene(folder).undistorted()  # the last part shows what this does
 camera = scene.cameras[0]
@@ -61,7 +56,7 @@ def draw_cameras(plotter):
     viz.add_cameras(plotter, scene.cameras, images=scene.image, size=size, most=8)
 
 
-orbit = Orbit(frames=8, size=(480, 720), elevation_degrees=40, zoom=1.1)
+orbit = Orbit(frames=8, size=(480, 720), elevation_degrees=40, zoom=1.5)
 Image.fromarray(viz.draw_view(orbit_cameras(scene.points[inside], orbit, up=up)[1], draw_cameras))
 
 # %% [markdown]
@@ -72,11 +67,13 @@ Image.fromarray(viz.draw_view(orbit_cameras(scene.points[inside], orbit, up=up)[
 #
 # $$z \, (u, v, 1)^\top = K \, (R X + t)$$
 #
-# Points have to lie on the things that they belong to. The colour of a dot is its depth. What stands in front of a point
-# is not asked, so points behind a table are drawn too. The centre of the first pixel is (0.5, 0.5), as in COLMAP.
+# Points have to lie on the things that they belong to. The colour of a dot is its depth. Of the points in a square of 4 x 4
+# pixels, only the nearest is drawn: most of the others are hidden behind it. The centre of the first pixel is (0.5, 0.5), as
+# in COLMAP.
 
 # %%
 import matplotlib.pyplot as plt
+import numpy as np
 from matplotlib_inline.backend_inline import set_matplotlib_formats
 
 from kfgs.cameras import project_points
@@ -84,11 +81,19 @@ from kfgs.cameras import project_points
 set_matplotlib_formats("jpeg")
 pixels, depths, seen = project_points(camera, scene.points)
 seen &= robust_bounds(scene.points).inside
-figure, axes = plt.subplots(figsize=(6.4, 4.4), layout="constrained")
+pixels, depths = pixels[seen], depths[seen]
+order = depths.argsort()
+squares = (pixels[order] // 4).int().numpy()
+nearest = order[np.unique(squares, axis=0, return_index=True)[1]]
+figure, axes = plt.subplots(figsize=(7.5, 5.2), layout="constrained")
 axes.imshow(scene.image(0).mean(-1), cmap="gray", vmin=-0.5, extent=(0, camera.width, camera.height, 0))
-dots = axes.scatter(*pixels[seen].T, c=depths[seen], s=2, cmap="plasma_r")
+dots = axes.scatter(*pixels[nearest].T, c=depths[nearest], s=5, cmap="plasma_r")
 figure.colorbar(dots, label="depth (units of the scene)", shrink=0.8)
-axes.set(title=f"{int(seen.sum()):,} points in {camera.name}", xlim=(0, camera.width), ylim=(camera.height, 0))
+axes.set(
+    title=f"{len(nearest):,} of {len(pixels):,} points in {camera.name}",
+    xlim=(0, camera.width),
+    ylim=(camera.height, 0),
+)
 plt.show()
 
 # %% [markdown]
@@ -109,7 +114,7 @@ def draw_split(plotter):
     plotter.add_legend(list(map(list, split_colors.items())), face="rectangle", bcolor="white", size=(0.15, 0.12))
 
 
-above = Orbit(frames=1, size=(480, 640), elevation_degrees=75, zoom=1.1)
+above = Orbit(frames=1, size=(480, 640), elevation_degrees=75, zoom=1.25)
 Image.fromarray(viz.draw_view(orbit_cameras(scene.points[inside], above, up=up)[0], draw_split))
 
 # %% [markdown]
@@ -131,7 +136,7 @@ if lens.distortion is None:
     lens = replace(lens, distortion=Distortion("brown_conrady", (-0.25, 0.06, 0.0, 0.0)))
 straight, pinhole, known = undistort(bent, lens)
 print(f"{lens.distortion}: {known.float().mean():.0%} of the new picture were recorded")
-Image.fromarray(viz.picture_grid([[bent, straight]], ["as taken", "lens removed"], width=384))
+Image.fromarray(viz.picture_grid([[bent, straight]], ["as taken", "lens removed"], width=360))
 
 # %% [markdown]
-# Next: [2_splat_a_feature_map](2_splat_a_feature_map.ipynb) puts features on Gaussians and draws them.
+# Next: [2_splatting](2_splatting.ipynb) puts features on Gaussians and draws them.

@@ -1,5 +1,5 @@
 # %% [markdown]
-# # 2. Splat a feature map
+# # 2. Splatting
 #
 # **How does a cloud of Gaussians become a picture, and how can that picture show features instead of colours?** You will
 # see four Gaussians projected, listed by tile, and blended from front to back. Then 20,000 of them carry the 512 numbers
@@ -10,23 +10,21 @@
 
 # %%
 # Your own data: a scene, and a folder with a feature map of each training view, as `kfgs features` writes it.
-import os
-from pathlib import Path
+from example import make_room
 
 from kfgs import FeatureFolder, load_scene
-from kfgs.toy import ToyConfig, make_toy_room
 
-data = Path(os.environ.get("KFGS_NOTEBOOK_DATA", "data"))
-folder = make_toy_room(data / "room", ToyConfig(train_views=24, test_views=6))
-scene = load_scene(folder)  # yours: load_scene("my/scene").undistorted()
+folder = make_room()  # yours: folder = Path("my/scene")
+scene = load_scene(folder).undistorted()
 train = scene.views("train")
 maps = FeatureFolder(folder / "features").of(scene, "train")
 
 # %% [markdown]
 # ## Four Gaussians and a camera
 #
-# A Gaussian has a position $p$, a scale $s$ (three standard deviations), a rotation $q$ (a quaternion w, x, y, z) and an
-# opacity $o$. It carries any number of channels $f'$. Drawing is a function $R$ of these and of the camera (Eq. 3):
+# A Gaussian has a position $p$, a scale $s$ (its standard deviation along each of its three axes), a rotation $q$ (a
+# quaternion w, x, y, z) and an opacity $o$. It carries any number of channels $f'$. Drawing is a function $R$ of these and of
+# the camera (Eq. 3):
 #
 # $$\mathbf{F}_r = R(p^2, s^2, q^2, o^2, f'; p_{cam})$$
 #
@@ -96,7 +94,7 @@ plt.show()
 #
 # $$\mathbf{F}_r(x) = \sum_i f'_i \, \alpha_i(x) \prod_{j < i} (1 - \alpha_j(x))$$
 #
-# The nearest one comes first. The last picture is the opacity of all four. `rasterize` does the three steps in one call.
+# The nearest one comes first. `rasterize` does the three steps in one call.
 
 # %%
 from kfgs import rasterize
@@ -104,10 +102,9 @@ from kfgs.splat import composite
 
 nearest_first = four.means[:, 2].argsort()
 steps = [rasterize(four.select(nearest_first[:count]), pinhole).map for count in range(1, 5)]
-maps4, alpha4 = composite(*projected[:2], projected.opacities, four.features[projected.index], tiles)
+maps4, _ = composite(*projected[:2], projected.opacities, four.features[projected.index], tiles)
 print(f"the three steps differ from rasterize by at most {float((maps4 - steps[-1]).abs().max()):.0e}")
-opacity = alpha4[..., None].expand(-1, -1, 3)
-Image.fromarray(viz.picture_grid([[*steps, opacity]], ["the nearest", "two", "three", "all four", "opacity"]))
+Image.fromarray(viz.picture_grid([steps], ["the nearest", "two", "three", "all four"], width=176))
 
 # %% [markdown]
 # ## A teacher's map
@@ -123,14 +120,14 @@ colors = viz.FeatureColors.fit(torch.cat([sample_grid(maps[i], samples=500) for 
 print(f"{len(maps)} maps of {maps.shape}")
 chosen = [0, len(train) // 3, 2 * len(train) // 3]
 rows = [[scene.image(train[i]) for i in chosen], [colors(maps[i]) for i in chosen]]
-Image.fromarray(viz.picture_grid(rows, width=min(scene.cameras[0].width, 320)))
+Image.fromarray(viz.picture_grid(rows, width=240))
 
 # %% [markdown]
 # ## Features on Gaussians
 #
 # We put a round Gaussian on each point of the scene. Then each takes the mean of the teacher's features at the pixels that
 # show it, weighted by how much it shows there. No training is needed. The Gaussians are round and large, so the edges are
-# blurred; [notebook 4](4_a_semantic_field_from_start_to_end.ipynb) does it with sharp ones. One training view is kept
+# blurred; [notebook 4](4_a_field.ipynb) does it with sharp ones. One training view is kept
 # apart, to see how well the others predict it.
 
 # %%
@@ -160,7 +157,7 @@ rendering = rasterize(semantic, held)
 cosine = feature_cosine(resize_map(rendering.map, (h, w)), maps[apart])
 print(f"{tuple(rendering.map.shape)} rendered; cosine with the teacher on the view kept apart {float(cosine):.3f}")
 pictures = [scene.image(train[apart]), colors(maps[apart]), colors(rendering.map)]
-Image.fromarray(viz.picture_grid([pictures], ["photograph", "the teacher", "rendered features"], width=256))
+Image.fromarray(viz.picture_grid([pictures], ["photograph", "the teacher", "rendered features"], width=240))
 
 # %% [markdown]
 # ## Engines
@@ -184,4 +181,4 @@ for engine in available_engines("cpu"):
 print({engine: f"{seconds['reference'] / value:.0f} times as fast" for engine, value in seconds.items()})
 
 # %% [markdown]
-# Next: [3_the_codebook_grows](3_the_codebook_grows.ipynb) makes 512 channels small enough to train.
+# Next: [3_the_codebook](3_the_codebook.ipynb) makes 512 channels small enough to train.

@@ -1,5 +1,5 @@
 # %% [markdown]
-# # 3. The codebook grows
+# # 3. The codebook
 #
 # **Why can 512 numbers per pixel become 9, and the meaning stay?** This is the paper's compression (Sec. 3.3). A scene
 # contains only some dozens of things, so the features of all pixels are copies, with noise, of a few *codewords*. A
@@ -11,19 +11,16 @@
 
 # %%
 # Your own data: a scene, its feature maps as `kfgs features` writes them, and the teacher's words (`kfgs features --words`).
-import os
-from pathlib import Path
+from example import DATA, make_room
 
 from kfgs import FeatureFolder, load_label_set, load_scene
-from kfgs.toy import ToyConfig, make_toy_room
 
-data = Path(os.environ.get("KFGS_NOTEBOOK_DATA", "data"))
-folder = make_toy_room(data / "room", ToyConfig(train_views=24, test_views=6))
-scene = load_scene(folder)  # yours: load_scene("my/scene").undistorted()
+folder = make_room()  # yours: folder = Path("my/scene")
+scene = load_scene(folder).undistorted()
 train = scene.views("train")
 maps = FeatureFolder(folder / "features").of(scene, "train")
 words = load_label_set(folder / "classes.json", folder / "text.npy")  # yours: load_label_set("words.safetensors")
-pictures = data / "pictures"
+pictures = DATA / "pictures"
 pictures.mkdir(exist_ok=True)
 
 # %% [markdown]
@@ -52,8 +49,10 @@ books = {}
 for alpha in (0.9, 0.7):
     config = PaperCodebook(epochs=4, step_every=2, joins_per_image=1, expand_below=alpha)
     books[f"alpha = {alpha}"] = fit_codebook(maps, config)
-plot_history({name: book.report.history for name, book in books.items()}, pictures / "growth.png")
-Shown(pictures / "growth.png", width=900)
+drawn = ("epoch", "size", "added", "coverage", "mean_similarity")
+history = {name: [{key: row[key] for key in drawn} for row in book.report.history] for name, book in books.items()}
+plot_history(history, pictures / "growth.png")
+Shown(pictures / "growth.png", width=720)
 
 # %% [markdown]
 # *Coverage* is the share of features whose similarity to their codeword is at least $\alpha$. With $\alpha = 0.9$, the
@@ -113,16 +112,9 @@ colors = FeatureColors.fit(codebook.codewords)
 rows = []
 for i in (0, 2 * len(maps) // 3):
     index = torch.from_numpy(index_maps[i]).long().clamp_max(codebook.size - 1)  # K where the teacher says nothing
-    rows.append(
-        [
-            scene.image(train[i]),
-            colors(maps[i]),
-            colors(codebook.codewords)[index],
-            palette(classes, words.names)[index],
-        ]
-    )
-titles = ["photograph", "the teacher", "its codewords", "their classes"]
-Image.fromarray(picture_grid(rows, titles, width=min(scene.cameras[0].width, 320)))
+    rows.append([colors(maps[i]), colors(codebook.codewords)[index], palette(classes, words.names)[index]])
+titles = ["the teacher", "its codewords", "their classes"]
+Image.fromarray(picture_grid(rows, titles, width=240, names=words.names))
 
 # %% [markdown]
 # ## From 512 channels to 9
@@ -157,6 +149,9 @@ plt.show()
 #
 # What is left to learn from: a byte per pixel, the codebook and the decoder. A map of latents is looked up when it is
 # needed: $\mathbf{F}_l = S'[M]$ (Sec. 3.3.2), where $S'$ is the codebook of latents.
+#
+# The decoder is larger than this codebook, so why nine channels? Because of what comes next: each Gaussian carries and trains
+# them, and each rendered pixel blends them. A blend of two latents is in no codebook, and the decoder says which feature it is.
 
 # %%
 from kfgs.quant import LatentMaps
@@ -173,4 +168,4 @@ for name, size in {"the teacher's maps": before, **sizes}.items():
 print(f"{before / sum(sizes.values()):.0f} times less; a map to learn is {tuple(latent_maps[0].shape)}")
 
 # %% [markdown]
-# Next: [4_a_semantic_field_from_start_to_end](4_a_semantic_field_from_start_to_end.ipynb) makes a field of such maps.
+# Next: [4_a_field](4_a_field.ipynb) makes a field of such maps.
