@@ -21,6 +21,7 @@ extensions = [
     "sphinx_design",
     "kfgs_commands",
     "kfgs_gallery",
+    "kfgs_live",
     "kfgs_references",
     "kfgs_shapes",
     "kfgs_offline",

@@ -11,6 +11,7 @@ import re
 from pathlib import Path
 from typing import Any
 
+from kfgs_live import frame
 from sphinx.application import Sphinx
 
 PAGES = Path(__file__).resolve().parents[1] / "gallery"
@@ -25,10 +26,16 @@ No executed notebook lies in `notebooks/` of this checkout. `python notebooks/ru
 def bring(notebooks: Path, pages: Path) -> list[str]:
     """Copy the notebooks to where Sphinx reads, write the list of them, and return their names."""
     paths = sorted(notebooks.glob("[0-9]*_*.ipynb"), key=lambda path: int(path.name.split("_")[0]))
-    files = {path.name: path.read_bytes() for path in paths}
+    files: dict[str, bytes] = {}
     cards = []
     for path in paths:
-        card, picture = _card(path.stem, json.loads(files[path.name]))
+        notebook = json.loads(path.read_bytes())
+        card, picture = _card(path.stem, notebook)
+        for cell in notebook["cells"]:
+            if "live" in cell["metadata"].get("tags", []):  # the viewer itself, in place of its still picture
+                shown = {"text/html": frame(f"{pages.name}/{path.stem}")}
+                cell["outputs"] = [{"output_type": "display_data", "data": shown, "metadata": {}}]
+        files[path.name] = json.dumps(notebook).encode()
         cards.append(card)
         files |= picture
     for old in [*pages.glob("*.ipynb"), *pages.glob("card_*")]:
