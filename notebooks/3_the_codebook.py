@@ -6,7 +6,7 @@
 # codebook of them grows until it covers the scene. Then an autoencoder makes 9 numbers of each. You will see the
 # book grow (as in Figure 6 of the paper), the words that its codewords mean, and how many bytes are left.
 #
-# About 15 seconds on two CPU cores (20 more to make the toy room the first time). Needs the extra
+# About 20 seconds on two CPU cores (20 more to make the toy room the first time). Needs the extra
 # `notebook`, no data.
 
 # %%

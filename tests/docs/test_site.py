@@ -34,6 +34,14 @@ def test_what_a_page_or_a_style_sheet_would_load_from_elsewhere_is_found(load):
     assert load("kfgs_offline").find_outside_style(sheet) == ["https://a.org/b.css", "//a.org/b.png"]
 
 
+def test_a_notebook_shows_the_viewer_live_in_place_of_its_still_picture(load, tmp_path):
+    pages = tmp_path / "gallery"
+    pages.mkdir()
+    load("kfgs_gallery").bring(EXTENSIONS.parents[1] / "notebooks", pages)
+    live = [path.name for path in pages.glob("*.ipynb") if "../_static/live.html" in path.read_text(encoding="utf-8")]
+    assert live == ["5_two_clouds_and_their_labels.ipynb"]
+
+
 @pytest.mark.parametrize("name", sorted(cli.COMMANDS))
 def test_every_option_of_a_command_is_in_its_table(name, load):
     commands = load("kfgs_commands")
