@@ -39,18 +39,19 @@ START = """async ({header, data}) => {
   const bytes = Uint8Array.from(atob(data), (letter) => letter.charCodeAt(0));
   globalThis.packed = {header, data: bytes.buffer};
   globalThis.canvas = document.querySelector("canvas");
-  globalThis.renderer ??= await kfgs.Renderer.create(canvas, {background: [0.25, 0.5, 0.75]});
-  renderer.load(packed);
+  globalThis.renderer = new kfgs.Renderer(canvas, packed, {background: [0.25, 0.5, 0.75]});
 }"""
 
 PICTURE = """async ({camera, side, look, marks}) => {
   canvas.width = camera.width;
   canvas.height = camera.height;
   renderer.setSide(side);
-  renderer.setLook({mode: "color", question: null, hidden: null, dim: false, outline: null, mixing: 1, ...look});
+  const scores = look.question === undefined ? null : kfgs.bufferOf(packed, `scores/${look.question}`);
+  renderer.setLook({mode: "color", hidden: null, dim: false, outline: null, mixing: 1, ...look, scores});
   renderer.setCamera(camera);
   renderer.draw();
-  await renderer.settled();
+  await renderer.ordered();
+  renderer.draw();
   return base64(shown());
 }"""
 
@@ -80,16 +81,12 @@ class Viewer:
         self.page.on("pageerror", lambda error: self.errors.append(str(error)))
         self.page.on("console", self._hear)
         self.page.set_content(f"<canvas></canvas><script>{before}{inline_script()}{BASE64}</script>")
-        self.load(packed)
+        self.run(START, {"header": packed.header, "data": base64.b64encode(packed.data).decode()})
 
     def _hear(self, said):
         """The driver remarks that reading a picture back takes time: no fault."""
         if said.type in ("error", "warning") and "GL Driver Message" not in said.text:
             self.errors.append(said.text)
-
-    def load(self, packed):
-        """Also in place of what is loaded."""
-        self.run(START, {"header": packed.header, "data": base64.b64encode(packed.data).decode()})
 
     def run(self, script, argument=None):
         return self.page.evaluate(script, argument)

@@ -1,10 +1,9 @@
 /** The viewer's interface: `mount` puts it into an element. Data come from a pack, answers from a link. */
 
 import { drawBoxes } from "./boxes.js";
-import { viewOf } from "./camera.js";
 import { TOOLS, makeCaptions, makeHelp, makePhoto, makeRail, makeTop, makeViews } from "./chrome.js";
 import { download, h, svg } from "./dom.js";
-import { Eye } from "./eye.js";
+import { Eye, between, viewOf } from "./eye.js";
 import { Model } from "./model.js";
 import { makePanel } from "./panel.js";
 import { Panes } from "./panes.js";
@@ -80,7 +79,7 @@ class App {
   async start() {
     const { panes, model } = this;
     const onlost = () => this.fail("The graphics card stopped drawing. Reload the page.");
-    await panes.start({ background: BACKGROUND[this.theme], onlost });
+    panes.start({ background: BACKGROUND[this.theme], onlost });
     this.eye = panes.eye = new Eye(this.header, model.extent(model.side));
     panes.ondraw = () => (this.placePhoto(), this.drawBoxes(), this.ondraw());
     this.tools = new Tools(this.stage, this.eye, this);
@@ -402,7 +401,7 @@ class App {
     const start = performance.now();
     const step = (now) => {
       const t = Math.min(Math.max((now - start) / GLIDE, 0), 1);
-      this.eye.toward(from, to, t * t * (3 - 2 * t));
+      this.eye.view = between(from, to, t * t * (3 - 2 * t));
       this.moves();
       if (t < 1) this.gliding = requestAnimationFrame(step);
     };

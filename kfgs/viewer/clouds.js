@@ -22,9 +22,6 @@ export function bufferOf(packed, name) {
   return new kind(packed.data, entry.offset, entry.length / kind.BYTES_PER_ELEMENT);
 }
 
-/** The number of a question of the pack: 3 for "scores/3". Objects do not keep the order of names like "10" and "2". */
-export const questionNumber = (buffer) => Number(buffer.split("/")[1]);
-
 /**
  * The data of a pack from its compressed form.
  * @param {Uint8Array} bytes a zlib stream (Packed.compressed), in which the bytes of a buffer are sorted by their place in a row

@@ -1,12 +1,23 @@
-/** The camera that a person moves: a view (camera.js) with its lens and its upward direction. */
-
-import { between, cameraOf, fit, fly, letterboxed, lookAround, lookAt } from "./camera.js";
-import { orbit, pan, pivot, turned, viewOf, viewmatOf, zoom } from "./camera.js";
+/**
+ * The camera that a person moves: a view with its lens and its upward direction. A view {R, position, distance} has the
+ * camera's x (right), y (down) and z (forward) as the rows of R, [9]; the pivot lies `distance` in front of the camera.
+ */
 
 const AXES = [[0, -1, 0], [0, 0, 1], [0, 1, 0], [1, 0, 0], [-1, 0, 0], [0, 0, -1]]; // that may be up
 const FOV = 0.9; // radians, if the scene has no cameras
 const TURN = 0.006; // radians for a pixel
 const FLY = 0.4; // of the scene's radius for a second
+const STEEP = Math.PI / 2 - 0.02; // radians: a view never tips over
+
+const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
+const add = (a, b, s = 1) => [a[0] + s * b[0], a[1] + s * b[1], a[2] + s * b[2]];
+const unit = (a) => add([0, 0, 0], a, 1 / (Math.hypot(...a) || 1));
+const axis = (view, k) => view.R.slice(3 * k, 3 * k + 3);
+const pivot = (view) => add(view.position, axis(view, 2), view.distance);
+
+/** How far a point lies in front of a view. */
+const ahead = (view, point) => dot(add(point, view.position, -1), axis(view, 2));
 
 export class Eye {
   /**
@@ -23,8 +34,7 @@ export class Eye {
     this.focus = cameras.length ? focus : ball.center; // what is in the middle of all; null: one stands inside
     this.loose = false; // whether a drag looks around, for there is nothing to turn about
     const aside = Math.abs(up[0]) < 0.9 ? [1, 0.6, 0.6] : [0.6, 1, 0.6];
-    const away = aside.map((value, axis) => ball.center[axis] + ball.radius * (value + up[axis]));
-    this.view = lookAt(away, ball.center, up);
+    this.view = lookAt(add(ball.center, add(aside, up), ball.radius), ball.center, up);
     this.fit(ball);
   }
 
@@ -34,10 +44,17 @@ export class Eye {
    */
   at(width, height) {
     const { lens } = this;
+    const viewmat = viewmatOf(this.view);
     this.size = [width, height];
-    if (!lens) return cameraOf(this.view, width, height, Math.min(FOV, (FOV * height) / width), 0.01);
-    const scale = this.whole ? undefined : Math.max(width, height) / Math.max(lens.width, lens.height);
-    return letterboxed({ ...lens, viewmat: viewmatOf(this.view) }, width, height, scale);
+    if (!lens) {
+      const f = height / 2 / Math.tan(Math.min(FOV, (FOV * height) / width) / 2);
+      return { viewmat, fx: f, fy: f, cx: width / 2, cy: height / 2, width, height, near: 0.01 };
+    }
+    const own = [width / lens.width, height / lens.height];
+    const scale = this.whole ? Math.min(...own) : Math.max(width, height) / Math.max(lens.width, lens.height);
+    const [fx, fy, cx, cy] = lens.K.map((value) => value * scale);
+    const [left, top] = [(width - scale * lens.width) / 2, (height - scale * lens.height) / 2];
+    return { viewmat, fx, fy, cx: cx + left, cy: cy + top, width, height, near: lens.near };
   }
 
   /** Look through a camera of the pack. */
@@ -62,7 +79,8 @@ export class Eye {
     const half = Math.min(width / fx, height / fy) / 2; // tangent
     const own = from && Math.min(from.width / from.K[0], from.height / from.K[1]) / 2;
     const most = from ? this.view.distance * Math.max(own / half, 1) : Infinity;
-    this.view = fit(this.view, center, radius, 2 * Math.atan(half), most);
+    const distance = Math.min(Math.max(radius, 1e-6) / Math.sin(Math.atan(half)), most);
+    this.view = { ...this.view, distance, position: add(center, axis(this.view, 2), -distance) };
     this.loose = false;
   }
 
@@ -72,41 +90,99 @@ export class Eye {
     this.loose = false;
   }
 
+  /** Turn about the pivot; dx and dy are pixels of a drag. */
   orbit(dx, dy) {
-    this.view = orbit(this.view, -TURN * dx, TURN * dy, this.up);
+    const R = turnedBy(this.view.R, -TURN * dx, TURN * dy, this.up);
+    this.view = { ...this.view, R, position: add(pivot(this.view), R.slice(6), -this.view.distance) };
   }
 
+  /** Look around from where the camera is. */
   turn(dx, dy) {
-    this.view = lookAround(this.view, (TURN / 2) * dx, -(TURN / 2) * dy, this.up);
+    this.view = { ...this.view, R: turnedBy(this.view.R, (TURN / 2) * dx, -(TURN / 2) * dy, this.up) };
     this.aim();
   }
 
   /** Take the next of the axes as up; or turn the picture by an angle in radians. */
   roll(angle = 0) {
-    const at = AXES.findIndex((axis) => axis.every((value, k) => Math.abs(value - this.up[k]) < 0.01));
+    const at = AXES.findIndex((own) => own.every((value, k) => Math.abs(value - this.up[k]) < 0.01));
     this.up = angle ? turned(this.up, this.view.R.slice(6), angle) : AXES[(at + 1) % AXES.length];
     this.view = lookAt(this.view.position, pivot(this.view), this.up);
   }
 
-  pan(dx, dy) {
-    this.view = pan(this.view, dx, dy, this.focal);
+  /** Move along the camera's axes [right, up, forward], in world units. */
+  shift([right, up, forward]) {
+    const aside = add(add(this.view.position, axis(this.view, 0), right), axis(this.view, 1), -up);
+    this.view = { ...this.view, position: add(aside, axis(this.view, 2), forward) };
   }
 
+  /** Move with the pivot, which follows the pointer. */
+  pan(dx, dy) {
+    const step = this.view.distance / this.focal;
+    this.shift([-dx * step, dy * step, 0]);
+  }
+
+  /** Come closer to the pivot (factor < 1) or move away from it. */
   zoom(factor) {
-    this.view = zoom(this.view, factor);
+    const before = this.view.distance;
+    const distance = Math.max(before * factor, 1e-6);
+    this.shift([0, 0, before - distance]);
+    this.view = { ...this.view, distance };
   }
 
   /** Fly for so many seconds along [right, up, forward]. */
   fly(seconds, direction) {
-    this.view = fly(this.view, direction.map((value) => value * seconds * FLY * this.ball.radius));
+    this.shift(direction.map((value) => value * seconds * FLY * this.ball.radius));
     this.aim();
-  }
-
-  /** The views on the way to another one. */
-  toward(from, to, t) {
-    this.view = between(from, to, t);
   }
 }
 
-/** How far a point lies in front of a view. */
-const ahead = ({ position, R }, point) => point.reduce((all, value, axis) => all + (value - position[axis]) * R[6 + axis], 0);
+/** A view from a camera of the pack ({viewmat: 16 numbers}), with the pivot at a distance. */
+export function viewOf(m, distance) {
+  const R = [m[0], m[1], m[2], m[4], m[5], m[6], m[8], m[9], m[10]];
+  const position = [0, 1, 2].map((k) => -(m[k] * m[3] + m[4 + k] * m[7] + m[8 + k] * m[11]));
+  return { R, position, distance };
+}
+
+/** A view between two, t from 0 to 1, for a smooth change. */
+export function between(a, b, t) {
+  const mix = (p, q) => p.map((value, k) => value + t * (q[k] - value));
+  if (t >= 1) return b;
+  const distance = Math.exp((1 - t) * Math.log(a.distance) + t * Math.log(b.distance));
+  return { R: straight(mix(a.R, b.R)), position: mix(a.position, b.position), distance };
+}
+
+/** The view that looks from a position at a point. */
+function lookAt(position, point, up) {
+  const z = unit(add(point, position, -1));
+  const side = Math.abs(dot(z, unit(up))) > 0.999 ? (Math.abs(z[0]) < 0.9 ? [1, 0, 0] : [0, 1, 0]) : up;
+  const x = unit(cross(z, side));
+  return { R: [...x, ...cross(z, x), ...z], position, distance: Math.hypot(...add(point, position, -1)) };
+}
+
+/** The matrix from world to camera, row-major. */
+function viewmatOf({ R, position }) {
+  const t = [0, 1, 2].map((k) => -dot(R.slice(3 * k, 3 * k + 3), position));
+  return Float32Array.from([...R.slice(0, 3), t[0], ...R.slice(3, 6), t[1], ...R.slice(6, 9), t[2], 0, 0, 0, 1]);
+}
+
+/** A vector turned about a unit axis by an angle in radians (Rodrigues). */
+function turned(v, k, angle) {
+  const aside = add([0, 0, 0], v, Math.cos(angle));
+  return add(add(aside, cross(k, v), Math.sin(angle)), k, dot(k, v) * (1 - Math.cos(angle)));
+}
+
+/** Rows turned by yaw about `up` and by pitch about the camera's right axis, radians; the view never tips over. */
+function turnedBy(R, yaw, pitch, up) {
+  const rows = (own, k, angle) => [0, 3, 6].flatMap((j) => turned(own.slice(j, j + 3), k, angle));
+  const once = rows(R, unit(up), yaw);
+  const height = Math.asin(Math.max(-1, Math.min(1, dot(once.slice(6), unit(up)))));
+  const allowed = Math.max(-STEEP, Math.min(STEEP, height + pitch)) - height;
+  return straight(rows(once, unit(once.slice(0, 3)), allowed));
+}
+
+/** Rows made orthonormal again, so that rounding does not add up. */
+function straight(R) {
+  const z = unit(R.slice(6));
+  const x = unit(cross(R.slice(3, 6), z));
+  return [...x, ...cross(z, x), ...z];
+}

@@ -1,6 +1,6 @@
 /** Who answers questions: in an exported file the packed scores, else Python behind a page or a notebook. */
 
-import { bufferOf, questionNumber } from "./clouds.js";
+import { bufferOf } from "./clouds.js";
 
 const PATIENCE = 600_000; // milliseconds for an answer of a kernel, which may have other cells to run first
 const NEEDS_PYTHON = "Any other words need Python: open the scene with “kfgs view” or in a notebook.";
@@ -16,14 +16,14 @@ export class OfflineLink {
 
   /**
    * @param {string} words a class name, in any case
-   * @returns {Promise<{words, number, scores, gamma, how, low, high}>} `scores` is NaN where nothing is known
+   * @returns {Promise<{words, scores, gamma, how, low, high}>} `scores` is NaN where nothing is known
    * @throws {Error} a sentence for people, if there is no such class
    */
   async ask(words) {
     const name = className(words, this.names);
     const found = this.packed.header.query[name];
     if (!found) throw new Error(explain(words, this.names, NEEDS_PYTHON));
-    return { ...found, words: name, number: questionNumber(found.buffer), scores: bufferOf(this.packed, found.buffer) };
+    return { ...found, words: name, scores: bufferOf(this.packed, found.buffer) };
   }
 }
 
@@ -59,7 +59,7 @@ export class PythonLink extends OfflineLink {
     Object.assign(this, { call, phrases: packed.header.phrases, python: true });
   }
 
-  /** As `OfflineLink.ask`; there is no `number` for words that only Python answers. */
+  /** As `OfflineLink.ask`, for any words if Python has the teacher's text encoder. */
   async ask(words) {
     if (className(words, this.names) !== null) return super.ask(words);
     if (!this.phrases) throw new Error(explain(words, this.names, NEEDS_TEACHER));

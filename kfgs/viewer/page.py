@@ -17,7 +17,7 @@ from .pack import pack_scene
 from .state import Exploration
 
 # a module comes after those that it imports
-RENDERER = ("sorter.js", "camera.js", "tint.js", "clouds.js", "shaders.js", "gl.js", "pick.js", "renderer.js")
+RENDERER = ("sorter.js", "tint.js", "clouds.js", "shaders.js", "gl.js", "pick.js", "renderer.js")
 INTERFACE = (
     "eye.js", "link.js", "model.js", "dom.js", "boxes.js", "panel.js", "tools.js", "panes.js", "chrome.js", "app.js",
     "shared.js",

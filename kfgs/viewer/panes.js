@@ -16,10 +16,9 @@ export class Panes {
   }
 
   /** Start WebGL; throws an Error with a sentence for people. */
-  async start(options) {
+  start(options) {
     const { model } = this;
-    this.renderer = await Renderer.create(this.canvas, options);
-    this.renderer.load(model.packed, model.clouds);
+    this.renderer = new Renderer(this.canvas, model.packed, { ...options, clouds: model.clouds });
     this.renderer.onorder = () => this.redraw();
   }
 
@@ -56,14 +55,14 @@ export class Panes {
     const { model, ratio } = this;
     this.prepare(pane);
     const first = this.dims(pane) && !evenly ? model.selected(pane.side) : null;
-    return this.renderer.pick(x * ratio, y * ratio, model.drawn(pane.side), first);
+    return this.renderer.pick(x * ratio, y * ratio, model.drawn(pane.side), first, this.viewport(pane));
   }
 
   /** A mask of the Gaussians seen in a polygon (CSS pixels) in the active pane; or `through` others, too. */
   inside(polygon, through) {
     this.prepare(this.active);
     const places = polygon.map((place) => place.map((value) => value * this.ratio));
-    return this.renderer.within(places, this.model.drawn(this.active.side), through);
+    return this.renderer.within(places, this.model.drawn(this.active.side), through, this.viewport(this.active));
   }
 
   /** Whether a pane dims what is not selected. The colours of scores say where gamma should be. */
@@ -127,7 +126,7 @@ export class Panes {
   async settled() {
     this.moving = false;
     this.draw();
-    await this.renderer.settled();
+    await this.renderer.ordered();
     this.draw();
   }
 
@@ -185,18 +184,9 @@ export class Panes {
     const hidden = new Uint8Array(model.names.length + 1);
     for (const label of model.hidden) hidden[label < 0 ? model.names.length : label] = 1;
     renderer.setLook({
-      mode: pane.mode, question: answer ? this.question(answer) : null, gamma: model.gamma ?? 0, lambda: model.lambda,
+      mode: pane.mode, scores: answer?.scores ?? null, gamma: model.gamma ?? 0, lambda: model.lambda,
       low, high, hidden, mixing: pane.mode === "labels" ? MIXING : 1,
       dim: this.dims(pane),
     });
-  }
-
-  /** What the renderer calls a question; scores that came from Python are sent once. */
-  question(answer) {
-    if (answer.number === undefined) {
-      answer.number = `words ${answer.id} ${answer.words}`; // no number of a class, whatever the words
-      this.renderer.setScores(answer.number, answer.scores);
-    }
-    return answer.number;
   }
 }

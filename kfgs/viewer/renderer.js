@@ -2,7 +2,7 @@
  * Draws clouds of Gaussians with WebGL 2 by the rules of kfgs's rasteriser. Class, score and distance to the semantic cloud
  * are textures, so that gamma, lambda, hidden classes and modes change with a uniform and without Python.
  */
-import {UNKNOWN, bufferOf, cloudsOf, questionNumber} from "./clouds.js";
+import {UNKNOWN, bufferOf, cloudsOf} from "./clouds.js";
 import {bind, fill, frame, program, rectangles, row, sheet, texture, withAlpha} from "./gl.js";
 import {gaussianAt, gaussiansIn} from "./pick.js";
 import {BATCH, COVERED, FINISH, PREPARE, SPLAT_FRAGMENT, SPLAT_VERTEX, WHOLE, WIDTH} from "./shaders.js";
@@ -23,7 +23,7 @@ const SLOW = 90; // ms for a moving frame: then the next ones are smaller
 const PIECES = 8; // parts of the order, between which covered pixels are found
 const MARGIN = 1.1; // of the picture whose Gaussians are sorted, so that a turn shows no empty border
 const LOOK = {
-  mode: "color", question: null, gamma: 0, lambda: 1, low: 0, high: 1, hidden: null, dim: true, mixing: 1,
+  mode: "color", scores: null, gamma: 0, lambda: 1, low: 0, high: 1, hidden: null, dim: true, mixing: 1,
   outline: [1, 0.85, 0.1],
 };
 
@@ -39,23 +39,19 @@ function roundedUp(value) {
 /** One canvas, up to two clouds. */
 export class Renderer {
   /**
-   * Start WebGL on a canvas.
+   * Start WebGL on a canvas, and load a pack.
    * @param {HTMLCanvasElement} canvas
-   * @param {{background?: number[], onlost?: function}} options background: red, green, blue in 0..1; onlost: called when
-   *   the browser takes the graphics context away
+   * @param {{header: object, data: ArrayBuffer}} packed
+   * @param {{clouds?: object, background?: number[], onlost?: function}} options clouds: those of the pack by side;
+   *   background: red, green, blue in 0..1; onlost: called when the browser takes the graphics context away
    * @throws {Error} with a sentence for people
    */
-  static async create(canvas, options = {}) {
+  constructor(canvas, packed, {clouds = cloudsOf(packed), background = [1, 1, 1], onlost = null} = {}) {
     const gl = canvas.getContext("webgl2", {antialias: false, depth: false, alpha: false, preserveDrawingBuffer: true});
     if (!gl) {
       throw new Error("This browser has no WebGL 2. Switch on hardware acceleration in its settings, or try another browser.");
     }
-    return new Renderer(canvas, gl, options);
-  }
-
-  constructor(canvas, gl, {background = [1, 1, 1], onlost = null} = {}) {
     Object.assign(this, {canvas, gl, background, onorder: null});
-    this.stats = {drawn: 0, sortMs: 0, frameMs: 0, scale: 1};
     const float = gl.getExtension("EXT_color_buffer_float") || gl.getExtension("EXT_color_buffer_half_float");
     this.format = float ? gl.RGBA16F : gl.RGBA8; // 8 bits cost accuracy, not more
     this.programs = {
@@ -67,12 +63,9 @@ export class Renderer {
     };
     this.empty = gl.createVertexArray();
     this.rectangles = rectangles(gl);
-    this.look = {...LOOK};
     this.sides = {};
-    this.side = null;
     this.camera = null;
     this.target = null;
-    this.views = new Map(); // what was drawn since the camera was set
     this.level = FIRST;
     this.loads = 0;
     this.waiting = [];
@@ -82,16 +75,8 @@ export class Renderer {
       onlost?.();
     };
     canvas.addEventListener("webglcontextlost", this.onlost);
-  }
-
-  /** Load a pack: {header, data: ArrayBuffer}, and its clouds by side. What was loaded before is dropped. */
-  load(packed, clouds = cloudsOf(packed)) {
-    this.#forget();
-    const {gl} = this;
-    const {header} = packed;
-    this.names = header.classes;
-    this.scores = {null: bufferOf(packed, "semantic/label_scores")};
-    for (const {buffer} of Object.values(header.query)) this.scores[questionNumber(buffer)] = bufferOf(packed, buffer);
+    this.names = packed.header.classes;
+    this.labelScores = bufferOf(packed, "semantic/label_scores");
     const labels = bufferOf(packed, "semantic/labels");
     const latents = bufferOf(packed, "semantic/latents");
     this.shared = {
@@ -101,15 +86,14 @@ export class Renderer {
       colormap: row(gl, withAlpha(bufferOf(packed, "colormap"))),
       classes: row(gl, new Uint8Array(4 * (this.names.length + 1))),
     };
-    this.inTexture = undefined;
     Object.values(clouds).forEach((cloud) => this.#addSide(cloud));
     this.side = "color" in this.sides ? "color" : "semantic";
+    this.look = {...LOOK};
     this.setLook({});
   }
 
   /** Choose the cloud that is drawn next: "color" or "semantic". */
   setSide(side) {
-    if (!(side in this.sides)) throw new Error(`There is no ${side} cloud in this file.`);
     this.side = side;
   }
 
@@ -121,14 +105,12 @@ export class Renderer {
   setCamera(camera) {
     const {width, height} = camera;
     this.camera = {cx: width / 2, cy: height / 2, near: 0.01, ...camera, viewmat: Float32Array.from(camera.viewmat)};
-    this.views.clear();
   }
 
-  /** Change some of the options of `LOOK`. question: number of a question of the pack, name given to setScores, or null. */
+  /** Change some of the options of `LOOK`. scores: of the question, one for each semantic Gaussian, or null. */
   setLook(changes) {
     this.look = {...this.look, ...changes};
     const {gl, look} = this;
-    if (!this.shared) return;
     const groups = new Uint8Array(4 * (this.names.length + 1));
     const colors = [[128, 128, 128], ...this.names.map(({color}) => color)];
     colors.forEach((color, k) => {
@@ -137,14 +119,10 @@ export class Renderer {
     });
     gl.bindTexture(gl.TEXTURE_2D, this.shared.classes);
     gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, colors.length, 1, gl.RGBA, gl.UNSIGNED_BYTE, groups);
-    this.#showScores();
-  }
-
-  /** Scores of the semantic Gaussians for a new question; NaN where nothing is known. */
-  setScores(name, scores) {
-    this.scores[name] = scores;
-    if (this.inTexture === name) this.inTexture = undefined;
-    this.#showScores();
+    const scores = look.scores ?? this.labelScores;
+    if (this.inTexture === scores) return;
+    fill(gl, this.shared.scores, gl.R32F, scores.map((value) => (Number.isFinite(value) ? value : UNKNOWN)));
+    this.inTexture = scores;
   }
 
   /** Mark Gaussians of the current side as selected, instead of what the question selects; null takes the marks away. */
@@ -182,50 +160,28 @@ export class Renderer {
    */
   draw(viewport = {}) {
     const view = {x: 0, y: 0, width: this.canvas.width, height: this.canvas.height, ...viewport};
-    view.side = this.side;
-    const clip = view.clip ?? view;
-    this.views.set(`${clip.x},${clip.y},${clip.width},${clip.height}`, view);
     const state = this.#current();
     this.#ask(state, view.moving ? LEVELS[this.level].share : 1);
     this.#render(state, view);
     this.#time(view.moving);
   }
 
-  /** Wait until frames with an up-to-date order have been drawn in full. */
-  async settled() {
-    this.redraw();
-    if (await this.ordered()) this.redraw();
-  }
-
-  /** Wait until the order fits what was drawn last. Returns whether that was necessary. */
+  /** Wait until the order of what was drawn fits it: a frame drawn then is up to date. */
   async ordered() {
-    const stale = () => [...this.views.values()].some(({side}) => this.sides[side].fresh !== this.sides[side].asked);
-    if (!stale()) return false;
+    const stale = () => Object.values(this.sides).some(({asked, fresh}) => asked && asked !== fresh);
     while (stale()) await new Promise((resolve) => this.waiting.push(resolve));
-    return true;
-  }
-
-  /** Draw again, in full, what was drawn since the camera was set. */
-  redraw() {
-    const {side} = this;
-    for (const view of [...this.views.values()]) {
-      this.side = view.side;
-      this.draw({...view, moving: false});
-    }
-    this.side = side;
   }
 
   /** The number of the Gaussian seen at a pixel of the canvas, of those that a mask has; one of `first`, if there is one. */
-  pick(x, y, drawn, first = null) {
-    const {cloud, camera, left, top} = this.#under(x, y);
-    if (!cloud) return -1;
+  pick(x, y, drawn, first = null, viewport) {
+    const {cloud, camera, left, top} = this.#within(viewport);
     const found = first ? gaussianAt(cloud, camera, x - left, y - top, first.map((on, i) => on & drawn[i])) : -1;
     return found >= 0 ? found : gaussianAt(cloud, camera, x - left, y - top, drawn);
   }
 
   /** A mask of the Gaussians seen in a polygon (pixels of the canvas), of those that a mask has; or `through` others, too. */
-  within(polygon, drawn, through = false) {
-    const {cloud, camera, left, top} = this.#under(...polygon[0], true);
+  within(polygon, drawn, through = false, viewport) {
+    const {cloud, camera, left, top} = this.#within(viewport);
     return gaussiansIn(cloud, polygon.map(([x, y]) => [x - left, y - top]), camera, drawn, through);
   }
 
@@ -233,7 +189,9 @@ export class Renderer {
   dispose() {
     this.sorter.close();
     this.canvas.removeEventListener("webglcontextlost", this.onlost);
-    this.#forget();
+    Object.values(this.sides).forEach((state) => this.#dropSide(state));
+    Object.values(this.shared).forEach((made) => this.gl.deleteTexture(made));
+    this.#dropTarget();
     this.gl.getExtension("WEBGL_lose_context")?.loseContext();
   }
 
@@ -285,15 +243,6 @@ export class Renderer {
     fill(this.gl, textures.marks, this.gl.R8UI, removed.map((gone, i) => (selected?.[i] ? 1 : 0) | (gone << 1)));
   }
 
-  #showScores() {
-    const {question} = this.look;
-    if (!this.shared || this.inTexture === question) return;
-    const scores = this.scores[question];
-    if (!scores) throw new Error(`There are no scores for the question ${question}.`);
-    fill(this.gl, this.shared.scores, this.gl.R32F, scores.map((value) => (Number.isFinite(value) ? value : UNKNOWN)));
-    this.inTexture = question;
-  }
-
   /** Ask for an order that fits the camera, unless the last request was for it; one request at a time. */
   #ask(state, share) {
     if (state.asked?.camera === this.camera && state.asked.share === share) return;
@@ -314,14 +263,13 @@ export class Renderer {
     this.sorter.send({kind: "sort", side: state.cloud.side, load: state.id, share, view: viewmat, limits, near});
   }
 
-  #sorted({side, load, order, ms}) {
+  #sorted({side, load, order}) {
     const state = this.sides[side];
     if (!state || load !== state.id) return; // of what was loaded before
     state.busy = false;
     state.length = order.length;
     state.fresh = state.sent;
     fill(this.gl, state.textures.order, this.gl.R32UI, order);
-    this.stats.sortMs = ms;
     if (state.asked && state.asked !== state.fresh) this.#send(state);
     this.waiting.splice(0).forEach((resolve) => resolve());
     this.onorder?.(side);
@@ -333,7 +281,7 @@ export class Renderer {
     const {scale} = level;
     const width = Math.max(1, Math.round(view.width * scale));
     const height = Math.max(1, Math.round(view.height * scale));
-    const chosen = Boolean(look.outline) && (look.question !== null || Boolean(state.selected));
+    const chosen = Boolean(look.outline) && (look.scores !== null || Boolean(state.selected));
     this.#fitTarget(width, height, chosen);
     this.#prepare(state, width, height);
     const {target} = this;
@@ -362,8 +310,6 @@ export class Renderer {
     gl.bindVertexArray(this.empty);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
     gl.disable(gl.SCISSOR_TEST);
-    this.stats.drawn = state.length;
-    this.stats.scale = scale;
   }
 
   /** Compute the ellipse and the colour of every Gaussian in view. */
@@ -386,7 +332,7 @@ export class Renderer {
     gl.uniform1i(at.degree, cloud.planes ? meta.sh_degree : 0);
     gl.uniform1i(at.mode, MODES.indexOf(look.mode));
     gl.uniform1i(at.carried, cloud.source ? 1 : 0);
-    gl.uniform1i(at.asked, look.question === null ? 0 : 1);
+    gl.uniform1i(at.asked, look.scores === null ? 0 : 1);
     gl.uniform1i(at.masked, state.selected ? 1 : 0);
     gl.uniform1i(at.dim, look.dim ? 1 : 0);
     gl.uniform1i(at.antialiased, meta.antialiased ? 1 : 0);
@@ -487,46 +433,29 @@ export class Renderer {
       if (status === gl.TIMEOUT_EXPIRED) return void setTimeout(look, 2);
       gl.deleteSync(fence);
       this.timing = false;
-      this.stats.frameMs = performance.now() - start;
+      const took = performance.now() - start;
       if (!moving) {
-        if (this.level < 3 && this.stats.frameMs > 4 * SLOW) this.level = 3;
-      } else if (this.stats.frameMs > SLOW) {
+        if (this.level < 3 && took > 4 * SLOW) this.level = 3;
+      } else if (took > SLOW) {
         this.level = Math.min(this.level + 1, LEVELS.length - 1);
-      } else if (this.stats.frameMs < 0.45 * SLOW) {
+      } else if (took < 0.45 * SLOW) {
         this.level = Math.max(this.level - 1, 0);
       }
     };
     setTimeout(look, 0);
   }
 
-  /** The cloud and the camera of the viewport under a pixel; `anyway`: of the last one, if there is none. */
-  #under(x, y, anyway = false) {
-    const views = [...this.views.values()].reverse();
-    const holds = ({x: left, y: top, width, height}) => x >= left && x < left + width && y >= top && y < top + height;
-    const view = views.find((one) => holds(one.clip ?? one)) ?? (anyway ? views[0] : null);
-    if (!view) return {};
+  /** The cloud that is drawn in a viewport, with the camera of its picture and the place of that. */
+  #within({x: left, y: top, width, height} = {x: 0, y: 0, width: this.canvas.width, height: this.canvas.height}) {
     const {camera} = this;
-    const [sx, sy] = [view.width / camera.width, view.height / camera.height];
-    const stretched = {
-      ...camera, fx: camera.fx * sx, cx: camera.cx * sx, fy: camera.fy * sy, cy: camera.cy * sy,
-      width: view.width, height: view.height,
-    };
-    return {cloud: this.sides[view.side].cloud, camera: stretched, left: view.x, top: view.y};
+    const [sx, sy] = [width / camera.width, height / camera.height];
+    const own = {fx: camera.fx * sx, cx: camera.cx * sx, fy: camera.fy * sy, cy: camera.cy * sy, width, height};
+    return {cloud: this.#current().cloud, camera: {...camera, ...own}, left, top};
   }
 
   #dropSide({textures, shape, paint, prepared}) {
     const {gl} = this;
     [...Object.values(textures), shape, paint].forEach((made) => gl.deleteTexture(made));
     gl.deleteFramebuffer(prepared);
-  }
-
-  #forget() {
-    const {gl} = this;
-    Object.values(this.sides).forEach((state) => this.#dropSide(state));
-    Object.values(this.shared ?? {}).forEach((made) => gl.deleteTexture(made));
-    this.#dropTarget();
-    this.sides = {};
-    this.shared = null;
-    this.views.clear();
   }
 }

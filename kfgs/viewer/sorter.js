@@ -7,7 +7,7 @@
 
 /**
  * Answer messages. "load" gives {side, means, radii}; "sort" {side, load, share, view, limits,
- * near} is answered by {side, load, order, ms}; with a share below 1 always the same Gaussians are left out, chosen at random.
+ * near} is answered by {side, load, order}; with a share below 1 always the same Gaussians are left out, chosen at random.
  * @param {{onmessage: ?function, postMessage: function}} scope the worker, or an object like it
  */
 export function sorterMain(scope) {
@@ -71,10 +71,9 @@ export function sorterMain(scope) {
       clouds[side] = {means, radii, seen: new Uint32Array(n), other: new Uint32Array(n), depths: new Float32Array(n)};
     },
     sort({side, load, share, view, limits, near}) {
-      const start = performance.now();
       const cloud = clouds[side];
       const order = sort(cloud, look(cloud, share, view, limits, near));
-      scope.postMessage({side, load, order, ms: performance.now() - start}, [order.buffer]);
+      scope.postMessage({side, load, order}, [order.buffer]);
     },
   };
   scope.onmessage = ({data}) => answers[data.kind](data);
@@ -82,7 +81,7 @@ export function sorterMain(scope) {
 
 /**
  * Start the sorter in a worker; where the browser forbids that, in this thread.
- * @param {function} answer called with each {side, load, order, ms}
+ * @param {function} answer called with each {side, load, order}
  * @returns {{send: function(object, Array=): void, close: function(): void}}
  */
 export function startSorter(answer) {
