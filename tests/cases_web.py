@@ -45,10 +45,10 @@ START = """async ({header, data}) => {
 PICTURE = """async ({camera, side, look, marks}) => {
   canvas.width = camera.width;
   canvas.height = camera.height;
-  renderer.setSide(side);
+  renderer.side = side;
   const scores = look.question === undefined ? null : kfgs.bufferOf(packed, `scores/${look.question}`);
   renderer.setLook({mode: "color", hidden: null, dim: false, outline: null, mixing: 1, ...look, scores});
-  renderer.setCamera(camera);
+  renderer.camera = camera;
   renderer.draw();
   await renderer.ordered();
   renderer.draw();

@@ -1,10 +1,10 @@
 /** The viewer's interface: `mount` puts it into an element. Data come from a pack, answers from a link. */
 
-import { drawBoxes } from "./boxes.js";
 import { TOOLS, makeCaptions, makeHelp, makePhoto, makeRail, makeTop, makeViews } from "./chrome.js";
 import { download, h, svg } from "./dom.js";
-import { Eye, between, viewOf } from "./eye.js";
-import { Model } from "./model.js";
+import { Eye, ahead, between, viewOf } from "./eye.js";
+import { marksIn } from "./marks.js";
+import { Model, short } from "./model.js";
 import { makePanel } from "./panel.js";
 import { Panes } from "./panes.js";
 import { Tools } from "./tools.js";
@@ -14,7 +14,7 @@ const BACKGROUND = { light: [0.957, 0.961, 0.969], dark: [0.094, 0.102, 0.118] }
 const ROLL = Math.PI / 36; // radians
 const GLIDE = 350; // milliseconds of a move to another view
 const SAID = 9000; // milliseconds that a message stays
-const BRUSH = [6, 24, 120]; // pixels: smallest, first, largest radius
+const BRUSH = [6, 120]; // pixels: smallest and largest radius
 const NARROW = { narrow: 900, slim: 640, thin: 480 }; // CSS pixels of the width
 const LOW = 420; // of the height
 const ASIDE = 1; // how far beside the originals copies appear, of their radius
@@ -41,11 +41,11 @@ class App {
   constructor(root, packed, link) {
     Object.assign(this, { root, packed, link, header: packed.header, model: new Model(packed) });
     this.modes = possibleModes(packed.header);
-    this.brushRadius = BRUSH[1];
     this.through = false; // whether tools select what others hide, too
     this.photo = null; // number of the view whose photo is shown
     this.view = null; // number of the view that the camera is at
     this.urls = new Map();
+    this.marks = []; // {name, places}, that Python added
     this.ondraw = () => {}; // after each picture
     this.build();
   }
@@ -80,14 +80,15 @@ class App {
     const { panes, model } = this;
     const onlost = () => this.fail("The graphics card stopped drawing. Reload the page.");
     panes.start({ background: BACKGROUND[this.theme], onlost });
+    this.showThings(this.header.things);
     this.eye = panes.eye = new Eye(this.header, model.extent(model.side));
-    panes.ondraw = () => (this.placePhoto(), this.drawBoxes(), this.ondraw());
+    panes.ondraw = () => (this.drawMarks(), this.ondraw());
     this.tools = new Tools(this.stage, this.eye, this);
     if (Number.isInteger(this.header.default_view)) this.goTo(this.header.default_view);
     model.addEventListener("change", () => this.refresh());
     this.watch();
     await this.begin();
-    await this.panes.first();
+    await this.panes.settled(true);
     this.loading.remove();
     this.root.removeAttribute("aria-busy");
     this.stage.focus({ preventScroll: true });
@@ -324,9 +325,10 @@ class App {
 
   // what the tools ask for (see tools.js); places are CSS pixels of the stage
 
-  /** A click picks; in a split view, counts are then of this pane's cloud. */
+  /** A click picks, or puts an end of the tape; in a split view, counts are then of this pane's cloud. */
   click(x, y) {
     const { side } = this.panes.activate(x);
+    if (this.tools.tool === "tape") return this.model.measure(this.panes.surface(x, y));
     this.model.pick(side, this.panes.under(x, y));
   }
 
@@ -346,7 +348,7 @@ class App {
   /** Paint the selection with a round brush; a stroke is one step of undo. */
   brush(x, y, how, first) {
     const { side } = first ? this.panes.activate(x) : this.panes.active;
-    const r = this.brushRadius;
+    const r = this.tools.radius;
     const round = Array.from({ length: 16 }, (_, k) => [x + r * Math.cos((k * Math.PI) / 8), y + r * Math.sin((k * Math.PI) / 8)]);
     this.model.select(side, this.panes.inside(round, this.through), first || how === "subtract" ? how : "add", !first);
   }
@@ -356,18 +358,14 @@ class App {
     const { model, eye } = this;
     const found = model.extent(model.side);
     if (!found || !model.counts(model.side).selected) return this.say("Select something first, to move it.");
-    const step = this.panes.depth(found.center) / eye.focal;
+    const step = ahead(eye.view, found.center) / eye.focal;
     const [right, down, up] = [eye.view.R.slice(0, 3), eye.view.R.slice(3, 6), eye.up];
     const by = [0, 1, 2].map((axis) => step * (upward ? -dy * up[axis] : dx * right[axis] + dy * down[axis]));
     model.move(by, !first);
   }
 
-  brushSize() {
-    return this.brushRadius;
-  }
-
   sizeBrush(factor) {
-    this.brushRadius = Math.min(Math.max(this.brushRadius * factor, BRUSH[0]), BRUSH[2]);
+    this.tools.radius = Math.min(Math.max(this.tools.radius * factor, BRUSH[0]), BRUSH[1]);
   }
 
   // the camera
@@ -499,21 +497,28 @@ class App {
     if (this.photo !== null) this.showPhoto(null);
   }
 
-  placePhoto() {
-    if (this.photo === null) return;
-    const camera = this.header.cameras[this.photo];
-    const { clientWidth, clientHeight } = this.stage;
-    const scale = Math.min(clientWidth / camera.width, clientHeight / camera.height);
-    const [width, height] = [camera.width * scale, camera.height * scale];
-    this.photoOver.place({ width, height, left: (clientWidth - width) / 2, top: (clientHeight - height) / 2 });
+  /** Boxes of connected parts, what Python added, and the measuring tape. */
+  drawMarks() {
+    const { model, panes } = this;
+    const { parts, name, side } = model.parts ?? { parts: [] };
+    const boxes = parts.map(({ corners }, at) => ({ name: `${name} ${at + 1}`, places: corners }));
+    const tape = model.tape.length ? [{ name: model.length === null ? "" : short(model.length), places: model.tape }] : [];
+    const shown = panes.layout === "slider" ? panes.list.slice(0, 1) : panes.list;
+    const project = (place) => panes.project(place);
+    this.boxes.replaceChildren(...shown.map((pane) => {
+      const { x, width } = panes.viewport(pane);
+      const place = { x: x / panes.ratio, width: width / panes.ratio, height: "100%" };
+      return marksIn([...(pane.side === side ? boxes : []), ...this.marks, ...tape], place, project);
+    }));
   }
 
-  /** Boxes around connected parts. */
-  drawBoxes() {
-    const { parts, name = "" } = this.model.parts ?? { parts: [] };
-    const [pane] = this.panes.list.filter(({ side }) => side === this.model.parts?.side);
-    const found = pane ? parts.map(({ corners }, at) => ({ corners, name: `${name} ${at + 1}` })) : [];
-    drawBoxes(this.boxes, found, (point) => this.panes.project(point, pane));
+  /** Show what Python added, by name (see kfgs/viewer/things.py), in place of what it had added before. */
+  showThings(things) {
+    const named = Object.entries(things);
+    this.marks = named.flatMap(([name, { marks = [] }]) =>
+      marks.map((places, at) => ({ name: marks.length > 1 ? `${name} ${at + 1}` : name, places })));
+    this.panes.renderer.setSolids(named.map(([, thing]) => thing).filter(({ places }) => places));
+    this.panes.hurry();
   }
 
   // keys
@@ -532,10 +537,18 @@ class App {
       m: () => this.nextMode(), p: () => this.togglePhoto(), "[": () => this.step(-1), "]": () => this.step(1),
       x: () => this.setThrough(!this.through), r: () => (this.eye.roll(event.shiftKey ? ROLL : 0), this.moved()), ",": () => this.sizeBrush(0.8), ".": () => this.sizeBrush(1.25),
       Delete: () => model.remove(), Backspace: () => model.remove(),
-      Escape: () => (this.tools.tool === "move" ? model.clear() : this.setTool("move")),
+      Escape: () => this.escape(),
     };
     for (const [tool, [, own]] of Object.entries(TOOLS)) keys[own] = () => this.setTool(tool);
     if (!this.run(keys[key], event) && this.tools.press(event)) event.preventDefault();
+  }
+
+  /** Take the tape away; else put the tool away; else select nothing. */
+  escape() {
+    const { tool } = this.tools;
+    if (tool === "tape" && this.model.tape.length) this.model.measure(null);
+    else if (tool === "move") this.model.clear();
+    else this.setTool("move");
   }
 
   run(action, event) {

@@ -6,7 +6,7 @@ import { whole } from "./model.js";
 
 export const TOOLS = {
   move: ["Move the view", "1"], box: ["Box selection", "2"], lasso: ["Lasso selection", "3"], brush: ["Brush selection", "4"],
-  shift: ["Move the selected Gaussians (Shift: up and down)", "5"],
+  shift: ["Move the selected Gaussians (Shift: up and down)", "5"], tape: ["Measure: click two places", "6"],
 };
 const HOWS = [
   ["replace", "=", "Select anew"], ["add", "+", "Add to the selection (Shift)"], ["subtract", "−", "Subtract from the selection (Alt)"],
@@ -20,7 +20,7 @@ const HELP = [
   ["Drag", "turn the view; inside a room: look around"], ["Right drag, Shift + drag", "move it sideways"], ["Middle drag, Ctrl + drag", "look around"], ["Wheel, two fingers, + −", "zoom"],
   ["W A S D, Q E", "fly (Shift: faster)"], ["Click", "pick a Gaussian"], ["Double click", "turn about this point"],
   ["F", "fit the selection, or the first view"], ["R, Shift + R", "another axis is up, turn the picture by 5 degrees"], ["[ ]", "previous and next photo view"], ["P", "photo over the view"],
-  ["/", "search"], ["M", "next colour mode"], ["1 2 3 4", "move, box, lasso, brush"], ["5", "drag the selection (Shift: up and down)"], [", .", "smaller and larger brush"],
+  ["/", "search"], ["M", "next colour mode"], ["1 2 3 4", "move, box, lasso, brush"], ["5", "drag the selection (Shift: up and down)"], ["6", "measure: click two places"], [", .", "smaller and larger brush"],
   ["Shift or Alt + tool", "add to or subtract from the selection"], ["X", "select through: also what others hide"], ["Delete", "remove the selection"],
   ["Ctrl + I", "invert the selection"], ["Ctrl + Z, Ctrl + Shift + Z", "undo, redo"],
   ["Escape", "move tool, then clear the selection"],
@@ -81,7 +81,7 @@ export function makeRail(app) {
   const through = iconButton("through", "Select through: also what others hide", () => app.setThrough(!app.through), { key: "X" });
   const set = (tool) => {
     buttons.forEach((one) => one.setAttribute("aria-pressed", String(one.dataset.tool === tool)));
-    how.element.hidden = through.hidden = tool === "move" || tool === "shift";
+    how.element.hidden = through.hidden = ["move", "shift", "tape"].includes(tool);
     through.setAttribute("aria-pressed", String(app.through));
   };
   set("move");
@@ -145,7 +145,7 @@ export function makeViews(app) {
   return { element: h("div", group, ...buttons), set };
 }
 
-/** The photo of a view over the scene, with its opacity. Returns {elements, show(url), place({left, top, width, height})}. */
+/** The photo of a view over the scene, with its opacity. Returns {elements, show(url)}. */
 export function makePhoto() {
   const image = h("img", { class: "photo", alt: "", hidden: true });
   const fade = (event) => (image.style.opacity = event.target.value);
@@ -156,9 +156,6 @@ export function makePhoto() {
     show(url) {
       image.hidden = label.hidden = !url;
       if (url) image.src = url;
-    },
-    place(places) {
-      for (const [name, value] of Object.entries(places)) image.style[name] = `${value}px`;
     },
   };
 }

@@ -66,7 +66,6 @@ export class Cloud {
     this.planes = this.sh ? this.sh.length / 2 / this.count : 0;
     this.source = side === "color" ? own("source") : null; // the semantic Gaussian that gives the class; null: itself
     this.far = side === "color" ? own("far") : null; // its distance
-    this.origin = null; // the Gaussian of the pack that each one is, or is a copy of; null: itself
     this.means = this.#decodeMeans();
     this.removed = new Uint8Array(this.count);
     this.reach = null; // of pick.js
@@ -173,10 +172,9 @@ function renew(cloud, ...names) {
 /** Append copies; returns their numbers. */
 function append(cloud, rows) {
   const { count, planes, sh } = cloud;
-  cloud.origin ??= Uint32Array.from({ length: count }, (_, i) => i);
   cloud.source ??= Int32Array.from({ length: count }, (_, i) => i);
   cloud.far ??= new Float32Array(count); // its own class, at any lambda
-  for (const [name, width] of [["splats", 4], ["dc", 1], ["means", 3], ["removed", 1], ["source", 1], ["far", 1], ["origin", 1]])
+  for (const [name, width] of [["splats", 4], ["dc", 1], ["means", 3], ["removed", 1], ["source", 1], ["far", 1]])
     cloud[name] = withRows(cloud[name], rows, width);
   cloud.count += rows.length;
   if (sh) {

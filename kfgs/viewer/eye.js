@@ -17,7 +17,7 @@ const axis = (view, k) => view.R.slice(3 * k, 3 * k + 3);
 const pivot = (view) => add(view.position, axis(view, 2), view.distance);
 
 /** How far a point lies in front of a view. */
-const ahead = (view, point) => dot(add(point, view.position, -1), axis(view, 2));
+export const ahead = (view, point) => dot(add(point, view.position, -1), axis(view, 2));
 
 export class Eye {
   /**
@@ -39,7 +39,7 @@ export class Eye {
   }
 
   /**
-   * What Renderer.setCamera takes. No angle of view is wider than the photo's: beside an upright photo lies what few photos
+   * The `camera` of a renderer. No angle of view is wider than the photo's: beside an upright photo lies what few photos
    * show, and a very wide angle distorts. Thus some of the photo's longer side may be cut off, unless `whole`.
    */
   at(width, height) {

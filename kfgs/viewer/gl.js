@@ -45,6 +45,26 @@ export function rectangles(gl) {
   return made;
 }
 
+/** Triangles, or points without `faces`: {places: float32, colors: uint8, faces?: uint32}, each in base64. */
+export function solid(gl, {places, colors, faces}) {
+  const bytes = (text) => Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
+  const made = gl.createVertexArray();
+  gl.bindVertexArray(made);
+  const sent = (kind, text) => {
+    gl.bindBuffer(kind, gl.createBuffer());
+    gl.bufferData(kind, bytes(text), gl.STATIC_DRAW);
+    return gl.getBufferParameter(kind, gl.BUFFER_SIZE);
+  };
+  const points = sent(gl.ARRAY_BUFFER, places) / 12;
+  gl.vertexAttribPointer(0, 3, gl.FLOAT, false, 0, 0);
+  sent(gl.ARRAY_BUFFER, colors);
+  gl.vertexAttribPointer(1, 3, gl.UNSIGNED_BYTE, true, 0, 0);
+  [0, 1].forEach((at) => gl.enableVertexAttribArray(at));
+  const corners = faces ? sent(gl.ELEMENT_ARRAY_BUFFER, faces) / 4 : 0;
+  gl.bindVertexArray(null);
+  return {made, points, corners};
+}
+
 /** An empty texture without mipmaps. */
 export function texture(gl, format, width, height, filter = gl.NEAREST) {
   const made = gl.createTexture();

@@ -51,7 +51,7 @@ function explain(words, names, needs) {
 /** Answers from Python what the pack does not: session.py at the other end of a page's address or of a notebook's kernel. */
 export class PythonLink extends OfflineLink {
   /**
-   * @param {(name: string, args: object, attached?: Uint8Array) => Promise<[object, ArrayBuffer]>} call `callPage` or `callWidget`
+   * @param {(name: string, args: object, ...attached: BlobPart[]) => Promise<[object, ArrayBuffer]>} call `callPage` or `callWidget`
    * @param {{header: object, data: ArrayBuffer}} packed its header says whether Python answers any words
    */
   constructor(call, packed) {
@@ -81,9 +81,8 @@ export class PythonLink extends OfflineLink {
 
   /** Write the selected Gaussians of some sides into Python's folder; returns the paths. `edits`: of each side, see Model.editsOf. */
   async saveSelection({ words, gamma, lambda, edits, masks }) {
-    const bits = Object.values(masks).map(bitsOf);
-    const [answer] = await this.call("save_selection", { words, gamma, lambda, edits, sides: Object.keys(masks) }, joined(bits));
-    return answer.paths;
+    const args = { words, gamma, lambda, edits, sides: Object.keys(masks) };
+    return (await this.call("save_selection", args, ...Object.values(masks).map(bitsOf)))[0].paths;
   }
 
   /** Write the edited splats, and the edits as JSON. */
@@ -93,8 +92,10 @@ export class PythonLink extends OfflineLink {
 }
 
 /** Call Python over the page's own address; see server.py for the form of a message. */
-export async function callPage(name, args, attached) {
-  const sent = await fetch("call", { method: "POST", body: packMessage({ name, args }, attached) }).catch(() => null);
+export async function callPage(name, args, ...attached) {
+  const text = new TextEncoder().encode(JSON.stringify({ name, args }));
+  const body = new Blob([new Uint32Array([text.length]), text, ...attached]);
+  const sent = await fetch("call", { method: "POST", body }).catch(() => null);
   if (!sent) throw new Error("Python does not answer: has “kfgs view” ended?");
   if (!sent.ok) throw new Error(`Python refused this (${sent.status}). Reload the page, or select fewer Gaussians.`);
   return checked(readMessage(await sent.arrayBuffer()));
@@ -110,24 +111,18 @@ export function callWidget(model) {
     waiting.delete(message.id);
     answered?.([message.answer, buffers[0] ? plain(buffers[0]) : new ArrayBuffer(0)]);
   });
-  return async (name, args, attached = new Uint8Array(0)) => {
+  return async (name, args, ...attached) => {
     const id = `${view} ${++last}`;
     const answered = new Promise((resolve, reject) => {
       waiting.set(id, resolve);
       setTimeout(() => waiting.delete(id) && reject(new Error("Python does not answer: is the kernel busy, or has it ended?")), PATIENCE);
     });
-    model.send({ id, name, args }, undefined, [attached]);
+    model.send({ id, name, args }, undefined, attached);
     return checked(await answered);
   };
 }
 
-/** A JSON text with its length before it, and bytes after it. */
-export function packMessage(answer, attached = new Uint8Array(0)) {
-  const text = new TextEncoder().encode(JSON.stringify(answer));
-  return joined([new Uint8Array(new Uint32Array([text.length]).buffer), text, attached]);
-}
-
-/** The inverse of `packMessage`: [object, ArrayBuffer]. */
+/** The parts of an answer: [object, ArrayBuffer]. */
 export function readMessage(buffer) {
   const length = new DataView(buffer).getUint32(0, true);
   const text = new TextDecoder().decode(new Uint8Array(buffer, 4, length));
@@ -137,16 +132,6 @@ export function readMessage(buffer) {
 function checked([answer, attached]) {
   if (answer.error) throw new Error(answer.error);
   return [answer, attached];
-}
-
-function joined(parts) {
-  const all = new Uint8Array(parts.reduce((sum, part) => sum + part.length, 0));
-  let at = 0;
-  for (const part of parts) {
-    all.set(part, at);
-    at += part.length;
-  }
-  return all;
 }
 
 /** A mask with one bit for each Gaussian, the lowest first. */

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -31,6 +31,12 @@ class Asked(NamedTuple):
     high: float  # the largest useful gamma: 1, or the highest score
     known: bool  # whether it is one of the classes
     valid: Tensor  # [N] bool, whether anything is known about a Gaussian; the others are never selected
+
+    def packed(self) -> tuple[dict[str, Any], bytes]:
+        """The answer for the browser, and its scores, float32: NaN where nothing is known."""
+        own = self.selection
+        answer = {"words": self.words, "gamma": own.threshold, "how": own.how, "low": self.low, "high": self.high}
+        return answer, torch.where(self.valid, own.scores, torch.nan).cpu().numpy().astype("<f4").tobytes()
 
 
 class FieldMeaning:

@@ -33,6 +33,7 @@ export class Model extends EventTarget {
     this.lambda = header.lambda ? header.lambda.value : Infinity;
     this.hidden = new Set();
     this.picked = null; // {side, index}
+    this.tape = []; // up to two places [x, y, z]
     this.parts = null; // {side, name, parts, numbers}
     this.now = { ...NOTHING, edits: [], clouds: this.original, what: "", id: 0 };
     this.past = [];
@@ -317,6 +318,18 @@ export class Model extends EventTarget {
     this.changed();
   }
 
+  /** Put an end of the measuring tape to a place; a third one begins anew, null takes the tape away. */
+  measure(place) {
+    this.tape = place ? [...(this.tape.length === 1 ? this.tape : []), place] : [];
+    this.changed();
+  }
+
+  /** The length of the tape in world units; null without its two ends. */
+  get length() {
+    const [from, to] = this.tape;
+    return to ? Math.hypot(...from.map((value, axis) => to[axis] - value)) : null;
+  }
+
   /**
    * What is known about a Gaussian, the picked one by default; null if there is none, or it is hidden or removed. `distance` is that to the
    * nearest labelled one.
@@ -364,7 +377,7 @@ export class Model extends EventTarget {
       const selected = this.byHand || this.answer?.example ? textOf(this.selected(side)) : null;
       return [side, { count, selected, edits: this.editsOf(side) }];
     });
-    const shown = { hidden: [...this.hidden].sort((a, b) => a - b), side: this.side, picked: this.picked };
+    const shown = { hidden: [...this.hidden].sort((a, b) => a - b), side: this.side, picked: this.picked, tape: this.tape };
     return { format: "kfgs.view", version: 1, ...asked, ...shown, sides: Object.fromEntries(sides) };
   }
 
@@ -408,11 +421,12 @@ export class Model extends EventTarget {
     this.arrange(saved);
   }
 
-  /** Take over what is no step of undo: hidden classes, the side that is shown, the picked Gaussian, lambda. */
-  arrange({ hidden, side, picked, lambda }) {
+  /** Take over what is no step of undo: hidden classes, the side that is shown, the picked Gaussian, the tape, lambda. */
+  arrange({ hidden, side, picked, tape, lambda }) {
     this.hidden = new Set(hidden);
     if (this.sides.includes(side)) this.side = side;
     this.picked = picked ?? null;
+    this.tape = tape ?? [];
     this.setLambda(Number(lambda ?? this.lambda));
   }
 
@@ -447,6 +461,7 @@ export class Model extends EventTarget {
     const hidden = seen ? counts.selected - sum(this.selected(this.side).map((on, i) => on & seen[i])) : 0;
     if (hidden) lines.push(`${whole(hidden)} of these are hidden, and change with the others.`);
     if (counts.removed) lines.push(`${whole(counts.removed)} are removed.`);
+    if (this.length !== null) lines.push(`The tape is ${short(this.length)} world units long.`);
     return lines;
   }
 

@@ -127,6 +127,7 @@ def pack_scene(state: Exploration, *, title: str = "kfgs", scene: Scene | None =
             "words": None if asked is None else asked.words,
             "gamma": state.gamma,
         },
+        "things": state.things,
         "buffers": buffers.table,
     }
     return Packed(header, buffers.joined())
@@ -189,9 +190,8 @@ def find_focus(state: Exploration) -> list[float] | None:
     far, up = np.linalg.norm(point - centers, axis=1), np.array(state.up)
     places = as_array(state.cloud(state.sides[-1]).means) - point
     heights, top, reach = places @ up, ((centers - point) @ up).max(), np.median(far)
-    over = (
-        (heights > top) & (heights < top + 2 * reach) & (np.linalg.norm(places - np.outer(heights, up), axis=1) < reach)
-    )
+    aside = np.linalg.norm(places - np.outer(heights, up), axis=1)
+    over = (heights > top) & (heights < top + 2 * reach) & (aside < reach)
     looks = ((point - centers) * axes).sum(1) > 0.9 * far
     return point.tolist() if looks.mean() >= 0.9 and over.mean() < 0.01 else None
 
@@ -257,20 +257,10 @@ def _add_scores(buffers: _Buffers, state: Exploration, questions: Iterable[str])
     """Add the score of each question, and return what the answer suggests, by name."""
     answers: dict[str, dict[str, Any]] = {}
     for words in questions:
-        asked = state.meaning.ask(words)
-        if asked.words in answers:
-            continue
-        name = f"scores/{len(answers)}"
-        scores = as_array(asked.selection.scores).astype(np.float32)
-        buffers.add(name, np.where(as_array(asked.valid), scores, np.float32("nan")).astype(np.float32))
-        answers[asked.words] = {
-            "gamma": asked.selection.threshold,
-            "how": asked.selection.how,
-            "low": asked.low,
-            "high": asked.high,
-            "known": asked.known,
-            "buffer": name,
-        }
+        answer, scores = state.meaning.ask(words).packed()
+        if answer["words"] not in answers:
+            buffers.add(name := f"scores/{len(answers)}", np.frombuffer(scores, np.float32))
+            answers[answer["words"]] = answer | {"buffer": name}
     return answers
 
 

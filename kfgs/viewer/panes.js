@@ -1,5 +1,6 @@
 /** What is on the canvas: one picture, two side by side, or two with a border that moves. Owns the renderer. */
 
+import { gaussianAt, gaussiansIn, meeting } from "./pick.js";
 import { Renderer } from "./renderer.js";
 
 const MIXING = 0.7; // of the class colour over the Gaussian's own
@@ -38,31 +39,40 @@ export class Panes {
     this.layout = layout;
   }
 
-  /** The pane at a place (CSS pixels). */
-  at(x) {
-    return this.list[this.list.length > 1 && x * this.ratio >= this.border() ? 1 : 0];
-  }
-
-  /** The pane at a place becomes the active one: counts are of its side. */
+  /** The pane at a place (CSS pixels) becomes the active one: counts are of its side. */
   activate(x) {
-    this.active = this.at(x);
+    this.active = this.list[this.list.length > 1 && x * this.ratio >= this.border() ? 1 : 0];
     this.model.side = this.active.side;
     return this.active;
   }
 
-  /** The Gaussian at a place (CSS pixels) in a pane; -1 if there is none. A selected one first, unless `evenly`. */
-  under(x, y, pane = this.active, evenly = false) {
-    const { model, ratio } = this;
-    this.prepare(pane);
-    const first = this.dims(pane) && !evenly ? model.selected(pane.side) : null;
-    return this.renderer.pick(x * ratio, y * ratio, model.drawn(pane.side), first, this.viewport(pane));
+  /** What pick.js needs to look into the active pane, and places (CSS pixels) in its picture. */
+  into(...places) {
+    this.prepare(this.active);
+    const viewport = this.viewport(this.active);
+    const drawn = this.model.drawn(this.active.side);
+    return { drawn, ...this.renderer.seen(viewport), at: places.map(([x, y]) => [x * this.ratio - viewport.x, y * this.ratio]) };
+  }
+
+  /** The Gaussian at a place (CSS pixels) in the active pane, a selected one first; -1 if there is none. */
+  under(x, y) {
+    const { cloud, camera, drawn, at: [place] } = this.into([x, y]);
+    const chosen = this.dims(this.active) ? this.model.selected(this.active.side) : null;
+    const found = chosen ? gaussianAt(cloud, camera, ...place, chosen.map((on, i) => on & drawn[i])) : -1;
+    return found >= 0 ? found : gaussianAt(cloud, camera, ...place, drawn);
+  }
+
+  /** The place of the surface that is seen at a place (CSS pixels) in the active pane, [x, y, z]; null where there is none. */
+  surface(x, y) {
+    const { cloud, camera, drawn, at: [place] } = this.into([x, y]);
+    const index = gaussianAt(cloud, camera, ...place, drawn);
+    return index < 0 ? null : meeting(cloud, index, camera, ...place);
   }
 
   /** A mask of the Gaussians seen in a polygon (CSS pixels) in the active pane; or `through` others, too. */
   inside(polygon, through) {
-    this.prepare(this.active);
-    const places = polygon.map((place) => place.map((value) => value * this.ratio));
-    return this.renderer.within(places, this.model.drawn(this.active.side), through, this.viewport(this.active));
+    const { cloud, camera, drawn, at } = this.into(...polygon);
+    return gaussiansIn(cloud, at, camera, drawn, through);
   }
 
   /** Whether a pane dims what is not selected. The colours of scores say where gamma should be. */
@@ -70,18 +80,12 @@ export class Panes {
     return this.model.selecting && pane.mode !== "score";
   }
 
-  /** How far a point lies in front of the camera. */
-  depth([x, y, z]) {
-    const m = this.camera.viewmat;
-    return m[8] * x + m[9] * y + m[10] * z + m[11];
-  }
-
-  /** Where a point is seen in a pane, CSS pixels; null behind the camera. */
-  project(point, pane) {
+  /** Where a point is seen in each pane, CSS pixels; null behind the camera. */
+  project(point) {
     const { viewmat: m, fx, fy, cx, cy, near } = this.camera;
     const [x, y, z] = [0, 4, 8].map((row) => m[row] * point[0] + m[row + 1] * point[1] + m[row + 2] * point[2] + m[row + 3]);
     if (!(z > near)) return null;
-    return [this.viewport(pane).x + (fx * x) / z + cx, (fy * y) / z + cy].map((value) => value / this.ratio);
+    return [(fx * x) / z + cx, (fy * y) / z + cy].map((value) => value / this.ratio);
   }
 
   resize(width, height) {
@@ -114,18 +118,11 @@ export class Panes {
     this.resting = setTimeout(() => ((this.moving = false), this.redraw()), REST);
   }
 
-  /** Resolves when there is a picture, perhaps a coarse one that is drawn in full soon. */
-  async first() {
-    this.rest();
-    this.draw(); // nothing yet, but the order is asked for
-    await this.renderer.ordered();
-    this.draw();
-  }
-
-  /** Resolves when the picture is that of the state. */
-  async settled() {
-    this.moving = false;
-    this.draw();
+  /** Resolves when the picture is that of the state; a `coarse` one is drawn in full soon. */
+  async settled(coarse = false) {
+    if (coarse) this.rest();
+    else this.moving = false;
+    this.draw(); // and ask for the order of what is seen now
     await this.renderer.ordered();
     this.draw();
   }
@@ -147,7 +144,7 @@ export class Panes {
     const { width, height } = this.canvas;
     this.camera = this.eye.at(this.layout === "split" ? Math.floor(width / 2) : width, height);
     this.eye.focal = this.camera.fx / this.ratio;
-    this.renderer.setCamera(this.camera);
+    this.renderer.camera = this.camera;
   }
 
   /** The camera of the last picture in the form of the pack's. */
@@ -177,7 +174,7 @@ export class Panes {
   prepare(pane) {
     const { model, renderer } = this;
     const { answer } = model;
-    renderer.setSide(pane.side);
+    renderer.side = pane.side;
     renderer.update(model.clouds[pane.side]);
     renderer.setSelected(model.byHand ? model.selected(pane.side) : null);
     const [low, high] = answer ? [answer.low, answer.high] : model.packed.header.clim;

@@ -52,20 +52,24 @@ function splatsIn(cloud, camera, [x0, y0, x1, y1], drawn) {
   return splats.sort((p, q) => p.depth - q.depth || p.index - q.index);
 }
 
+/** The three axes of Gaussian i as unit vectors in the camera's axes, each with its standard deviation. */
+function axesOf(cloud, i, m) {
+  const [w, x, y, z] = cloud.quatOf(i);
+  const columns = [
+    [1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)],
+    [2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)],
+    [2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)],
+  ];
+  const scales = cloud.scalesOf(i);
+  return columns.map(([a, b, c], k) => [[0, 4, 8].map((row) => m[row] * a + m[row + 1] * b + m[row + 2] * c), scales[k]]);
+}
+
 /** The covariance (a, b; b, c) of Gaussian i on the screen, and its opacity there. */
 function ellipse(cloud, i, m, focal, tangent) {
-  const [w, x, y, z] = cloud.quatOf(i);
-  const s = cloud.scalesOf(i);
-  const R = [
-    [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-    [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-    [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-  ];
   let a = 0.3, b = 0, c = 0.3; // the low-pass
-  for (let k = 0; k < 3; k++) {
-    const turned = [0, 4, 8].map((row) => m[row] * R[0][k] + m[row + 1] * R[1][k] + m[row + 2] * R[2][k]);
-    const u = focal[0] * (turned[0] - tangent[0] * turned[2]) * s[k];
-    const v = focal[1] * (turned[1] - tangent[1] * turned[2]) * s[k];
+  for (const [turned, scale] of axesOf(cloud, i, m)) {
+    const u = focal[0] * (turned[0] - tangent[0] * turned[2]) * scale;
+    const v = focal[1] * (turned[1] - tangent[1] * turned[2]) * scale;
     a += u * u;
     b += u * v;
     c += v * v;
@@ -78,6 +82,21 @@ function ellipse(cloud, i, m, focal, tangent) {
 function alphaAt({x, y, a, b, c, det, opacity}, px, py) {
   const dx = px - x, dy = py - y;
   return Math.min(0.99, opacity * Math.exp((-0.5 * (c * dx * dx - 2 * b * dx * dy + a * dy * dy)) / det));
+}
+
+/** The place in the world where Gaussian i is densest along the ray through a pixel: on the surface, if it is flat. */
+export function meeting(cloud, i, {viewmat: m, fx, fy, cx, cy}, x, y) {
+  const ray = [(x - cx) / fx, (y - cy) / fy, 1];
+  const [a, b, c] = cloud.means.subarray(3 * i, 3 * i + 3);
+  const middle = [0, 4, 8].map((row) => m[row] * a + m[row + 1] * b + m[row + 2] * c + m[row + 3]);
+  let along = 0, across = 0;
+  for (const [axis, scale] of axesOf(cloud, i, m)) {
+    const [u, v] = [ray, middle].map((own) => (axis[0] * own[0] + axis[1] * own[1] + axis[2] * own[2]) / scale);
+    along += u * v;
+    across += u * u;
+  }
+  const place = ray.map((value, row) => (value * along) / across - m[4 * row + 3]);
+  return [0, 1, 2].map((k) => m[k] * place[0] + m[4 + k] * place[1] + m[8 + k] * place[2]);
 }
 
 /** How deep one sees at a place of a box: a function of x and y, to where less than half of the light comes through. */

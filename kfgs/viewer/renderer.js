@@ -3,9 +3,8 @@
  * are textures, so that gamma, lambda, hidden classes and modes change with a uniform and without Python.
  */
 import {UNKNOWN, bufferOf, cloudsOf} from "./clouds.js";
-import {bind, fill, frame, program, rectangles, row, sheet, texture, withAlpha} from "./gl.js";
-import {gaussianAt, gaussiansIn} from "./pick.js";
-import {BATCH, COVERED, FINISH, PREPARE, SPLAT_FRAGMENT, SPLAT_VERTEX, WHOLE, WIDTH} from "./shaders.js";
+import {bind, fill, frame, program, rectangles, row, sheet, solid, texture, withAlpha} from "./gl.js";
+import {BATCH, COVERED, FINISH, PREPARE, SOLID_FRAGMENT, SOLID_VERTEX, SPLAT_FRAGMENT, SPLAT_VERTEX, WHOLE, WIDTH} from "./shaders.js";
 import {startSorter} from "./sorter.js";
 
 const MODES = ["color", "labels", "score", "latents"];
@@ -21,6 +20,7 @@ const LEVELS = [
 const FIRST = 3; // level of the first moving frame: a picture soon, on any machine
 const SLOW = 90; // ms for a moving frame: then the next ones are smaller
 const PIECES = 8; // parts of the order, between which covered pixels are found
+const DOT = 1 / 110; // of the picture's height: the size of a point
 const MARGIN = 1.1; // of the picture whose Gaussians are sorted, so that a turn shows no empty border
 const LOOK = {
   mode: "color", scores: null, gamma: 0, lambda: 1, low: 0, high: 1, hidden: null, dim: true, mixing: 1,
@@ -36,7 +36,11 @@ function roundedUp(value) {
   return new Float32Array(bits.buffer)[0];
 }
 
-/** One canvas, up to two clouds. */
+/**
+ * One canvas, up to two clouds. `side` is the cloud that is drawn next, `camera` the view: {viewmat: 16 numbers, row-major,
+ * world to camera (x right, y down, z forward), fx, fy, cx, cy, width, height, near}; pixels of its own picture, which is
+ * stretched to the viewport. A camera that changed is another object.
+ */
 export class Renderer {
   /**
    * Start WebGL on a canvas, and load a pack.
@@ -58,12 +62,14 @@ export class Renderer {
       prepare: program(gl, WHOLE.replace("DEPTH", "0.0"), PREPARE),
       splat: program(gl, SPLAT_VERTEX, SPLAT_FRAGMENT),
       outlined: program(gl, SPLAT_VERTEX, SPLAT_FRAGMENT.replace("precision", "#define OUTLINE\nprecision")),
+      solid: program(gl, SOLID_VERTEX, SOLID_FRAGMENT),
       covered: program(gl, WHOLE.replace("DEPTH", "-1.0"), COVERED),
       finish: program(gl, WHOLE.replace("DEPTH", "0.0"), FINISH),
     };
     this.empty = gl.createVertexArray();
     this.rectangles = rectangles(gl);
     this.sides = {};
+    this.solids = [];
     this.camera = null;
     this.target = null;
     this.level = FIRST;
@@ -92,21 +98,6 @@ export class Renderer {
     this.setLook({});
   }
 
-  /** Choose the cloud that is drawn next: "color" or "semantic". */
-  setSide(side) {
-    this.side = side;
-  }
-
-  /**
-   * Set the view.
-   * @param {object} camera {viewmat: 16 numbers, row-major, world to camera (x right, y down, z forward), fx, fy, cx?, cy?,
-   *   width, height, near?}; pixels of the camera's own picture, which is stretched to the viewport
-   */
-  setCamera(camera) {
-    const {width, height} = camera;
-    this.camera = {cx: width / 2, cy: height / 2, near: 0.01, ...camera, viewmat: Float32Array.from(camera.viewmat)};
-  }
-
   /** Change some of the options of `LOOK`. scores: of the question, one for each semantic Gaussian, or null. */
   setLook(changes) {
     this.look = {...this.look, ...changes};
@@ -125,9 +116,16 @@ export class Renderer {
     this.inTexture = scores;
   }
 
+  /** Draw these points and meshes with the clouds, see `solid` of gl.js. */
+  setSolids(things) {
+    this.solids.forEach(({made}) => this.gl.deleteVertexArray(made));
+    this.solids = things.map((thing) => solid(this.gl, thing));
+    this.#dropTarget(); // it has a picture of them, if there are any
+  }
+
   /** Mark Gaussians of the current side as selected, instead of what the question selects; null takes the marks away. */
   setSelected(mask) {
-    const state = this.#current();
+    const state = this.sides[this.side];
     if (state.selected === mask) return;
     state.selected = mask;
     this.#showMarks(state);
@@ -160,7 +158,7 @@ export class Renderer {
    */
   draw(viewport = {}) {
     const view = {x: 0, y: 0, width: this.canvas.width, height: this.canvas.height, ...viewport};
-    const state = this.#current();
+    const state = this.sides[this.side];
     this.#ask(state, view.moving ? LEVELS[this.level].share : 1);
     this.#render(state, view);
     this.#time(view.moving);
@@ -172,31 +170,19 @@ export class Renderer {
     while (stale()) await new Promise((resolve) => this.waiting.push(resolve));
   }
 
-  /** The number of the Gaussian seen at a pixel of the canvas, of those that a mask has; one of `first`, if there is one. */
-  pick(x, y, drawn, first = null, viewport) {
-    const {cloud, camera, left, top} = this.#within(viewport);
-    const found = first ? gaussianAt(cloud, camera, x - left, y - top, first.map((on, i) => on & drawn[i])) : -1;
-    return found >= 0 ? found : gaussianAt(cloud, camera, x - left, y - top, drawn);
+  /** The cloud that is drawn, and the camera of its picture in a viewport: what pick.js works with. */
+  seen({width, height} = this.canvas) {
+    const {camera} = this;
+    const [sx, sy] = [width / camera.width, height / camera.height];
+    const own = {fx: camera.fx * sx, cx: camera.cx * sx, fy: camera.fy * sy, cy: camera.cy * sy, width, height};
+    return {cloud: this.sides[this.side].cloud, camera: {...camera, ...own}};
   }
 
-  /** A mask of the Gaussians seen in a polygon (pixels of the canvas), of those that a mask has; or `through` others, too. */
-  within(polygon, drawn, through = false, viewport) {
-    const {cloud, camera, left, top} = this.#within(viewport);
-    return gaussiansIn(cloud, polygon.map(([x, y]) => [x - left, y - top]), camera, drawn, through);
-  }
-
-  /** Free the worker and the graphics memory. */
+  /** Free the worker, and all graphics memory with the context. */
   dispose() {
     this.sorter.close();
     this.canvas.removeEventListener("webglcontextlost", this.onlost);
-    Object.values(this.sides).forEach((state) => this.#dropSide(state));
-    Object.values(this.shared).forEach((made) => this.gl.deleteTexture(made));
-    this.#dropTarget();
     this.gl.getExtension("WEBGL_lose_context")?.loseContext();
-  }
-
-  #current() {
-    return this.sides[this.side];
   }
 
   #addSide(cloud) {
@@ -295,6 +281,7 @@ export class Renderer {
     gl.clearDepth(1);
     gl.depthMask(true);
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
+    if (this.solids.length) this.#solid(width, height, chosen);
     this.#splat(state, level, chosen);
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     const bottom = this.canvas.height - view.y - view.height;
@@ -302,7 +289,7 @@ export class Renderer {
     gl.scissor(clip.x, this.canvas.height - clip.y - clip.height, clip.width, clip.height);
     const {finish} = this.programs;
     gl.useProgram(finish.program);
-    bind(gl, finish, {picture: target.picture, outline: target.outline});
+    bind(gl, finish, {picture: target.picture, outline: target.outline, solids: target.solids});
     gl.uniform4f(finish.at.viewport, view.x, bottom, view.width, view.height);
     gl.uniform3fv(finish.at.paper, this.background);
     gl.uniform3fv(finish.at.rim, look.outline ?? [0, 0, 0]);
@@ -312,6 +299,36 @@ export class Renderer {
     gl.disable(gl.SCISSOR_TEST);
   }
 
+  /** Draw points and meshes into a picture of their own, with the depth buffer of the Gaussians. */
+  #solid(width, height, chosen) {
+    const {gl, camera, target} = this;
+    const {at, program: used} = this.programs.solid;
+    gl.bindFramebuffer(gl.FRAMEBUFFER, target.solid);
+    gl.clear(gl.COLOR_BUFFER_BIT);
+    gl.enable(gl.DEPTH_TEST);
+    gl.depthFunc(gl.LEQUAL);
+    gl.useProgram(used);
+    this.#place(at, width, height);
+    gl.uniform1f(at.dotSize, Math.max(2, DOT * height));
+    for (const {made, points, corners} of this.solids) {
+      gl.uniform1i(at.meshed, corners ? 1 : 0);
+      gl.bindVertexArray(made);
+      if (corners) gl.drawElements(gl.TRIANGLES, corners, gl.UNSIGNED_INT, 0);
+      else gl.drawArrays(gl.POINTS, 0, points);
+    }
+    gl.bindFramebuffer(gl.FRAMEBUFFER, chosen ? target.both : target.one);
+  }
+
+  /** The camera, for a program that draws a picture of this size. */
+  #place(at, width, height) {
+    const {gl} = this;
+    const {viewmat, near, fx, fy, cx, cy} = this.seen({width, height}).camera;
+    gl.uniformMatrix4fv(at.view, true, viewmat);
+    gl.uniform4f(at.pinhole, fx, fy, cx, cy);
+    gl.uniform2f(at.size, width, height);
+    gl.uniform1f(at.near, near);
+  }
+
   /** Compute the ellipse and the colour of every Gaussian in view. */
   #prepare(state, width, height) {
     const {gl, camera, look, shared} = this;
@@ -319,7 +336,6 @@ export class Renderer {
     const {cloud, textures} = state;
     const {at} = prepare;
     const {meta} = cloud;
-    const [sx, sy] = [width / camera.width, height / camera.height];
     const m = camera.viewmat;
     gl.bindFramebuffer(gl.FRAMEBUFFER, state.prepared);
     gl.viewport(0, 0, WIDTH, Math.ceil(state.length / WIDTH));
@@ -344,12 +360,9 @@ export class Renderer {
     gl.uniform1f(at.shStep, meta.sh_step);
     gl.uniform1f(at.gamma, look.gamma);
     gl.uniform1f(at.mixing, look.mixing);
-    gl.uniform1f(at.near, camera.near);
+    this.#place(at, width, height);
     gl.uniform1f(at.share, state.fresh?.share ?? 1);
     gl.uniform1f(at.lambda, roundedUp(look.lambda));
-    gl.uniformMatrix4fv(at.view, true, m);
-    gl.uniform4f(at.pinhole, camera.fx * sx, camera.fy * sy, camera.cx * sx, camera.cy * sy);
-    gl.uniform2f(at.size, width, height);
     gl.uniform3fv(at.eye, [0, 1, 2].map((k) => -(m[k] * m[3] + m[4 + k] * m[7] + m[8 + k] * m[11])));
     gl.uniform3fv(at.paper, this.background);
     gl.bindVertexArray(this.empty);
@@ -362,7 +375,7 @@ export class Renderer {
     const used = chosen ? this.programs.outlined : this.programs.splat;
     const {covered} = this.programs;
     gl.enable(gl.DEPTH_TEST);
-    gl.depthFunc(gl.LESS);
+    gl.depthFunc(gl.LEQUAL);
     gl.blendFunc(gl.ONE_MINUS_DST_ALPHA, gl.ONE);
     const piece = Math.ceil(state.length / PIECES);
     for (let from = 0; from < state.length; from += piece) {
@@ -381,6 +394,7 @@ export class Renderer {
       bind(gl, used, {shapes: state.shape, paints: state.paint});
       gl.uniform2f(used.at.size, target.width, target.height);
       gl.uniform1f(used.at.least, least);
+      gl.uniform1f(used.at.near, this.camera.near);
       gl.enable(gl.BLEND);
       gl.depthMask(false);
       const end = Math.min(from + piece, state.length);
@@ -401,20 +415,22 @@ export class Renderer {
     this.#dropTarget();
     const picture = texture(gl, this.format, width, height, gl.LINEAR);
     const outline = texture(gl, gl.RGBA8, chosen ? width : 1, chosen ? height : 1, gl.LINEAR);
+    const solids = texture(gl, gl.RGBA8, this.solids.length ? width : 1, this.solids.length ? height : 1, gl.LINEAR);
     const depth = gl.createRenderbuffer();
     gl.bindRenderbuffer(gl.RENDERBUFFER, depth);
     gl.renderbufferStorage(gl.RENDERBUFFER, gl.DEPTH_COMPONENT24, width, height);
-    const both = chosen ? frame(gl, [picture, outline], depth) : null;
     this.target = {
-      width, height, picture, outline, depth, both, one: frame(gl, [picture], depth), depthOnly: frame(gl, [], depth),
+      width, height, picture, outline, solids, depth, both: chosen ? frame(gl, [picture, outline], depth) : null,
+      solid: this.solids.length ? frame(gl, [solids], depth) : null, one: frame(gl, [picture], depth),
+      depthOnly: frame(gl, [], depth),
     };
   }
 
   #dropTarget() {
     const {gl, target} = this;
     if (!target) return;
-    [target.picture, target.outline].forEach((made) => gl.deleteTexture(made));
-    [target.one, target.both, target.depthOnly].forEach((made) => made && gl.deleteFramebuffer(made));
+    [target.picture, target.outline, target.solids].forEach((made) => gl.deleteTexture(made));
+    [target.one, target.both, target.solid, target.depthOnly].forEach((made) => made && gl.deleteFramebuffer(made));
     gl.deleteRenderbuffer(target.depth);
     this.target = null;
   }
@@ -443,14 +459,6 @@ export class Renderer {
       }
     };
     setTimeout(look, 0);
-  }
-
-  /** The cloud that is drawn in a viewport, with the camera of its picture and the place of that. */
-  #within({x: left, y: top, width, height} = {x: 0, y: 0, width: this.canvas.width, height: this.canvas.height}) {
-    const {camera} = this;
-    const [sx, sy] = [width / camera.width, height / camera.height];
-    const own = {fx: camera.fx * sx, cx: camera.cx * sx, fy: camera.fy * sy, cy: camera.cy * sy, width, height};
-    return {cloud: this.#current().cloud, camera: {...camera, ...own}, left, top};
   }
 
   #dropSide({textures, shape, paint, prepared}) {

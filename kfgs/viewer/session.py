@@ -23,12 +23,12 @@ from ..gaussians import Gaussians
 from ..labels import EditList, Selection, connected_parts
 from ..labels.edit_list import read_edits
 from ..viz.linked import evenly
-from .meaning import Asked
 from .state import Exploration, Side
 
 Answer = tuple[dict[str, Any], bytes]
 EDITS = ("recolor", "opacity", "move", "duplicate", "remove")
 """What the viewer can do to a cloud. `Insert` is not among them: it would read files of this machine for who has the link."""
+CALLS = ("ask", "similar", "parts", "save_selection", "save_edits")
 MOST_PARTS = 16  # parts listed: as many as `connected_parts` renders in one pass of a view
 MOST_VIEWS = 30  # views compared, evenly chosen: 0.2 s with 600,000 Gaussians
 
@@ -42,13 +42,6 @@ class Session:
     def __init__(self, state: Exploration, out: str | Path = "kfgs_view") -> None:
         self.state, self.out = state, as_path(out)
         self._lock = Lock()
-        self._calls = {
-            "ask": self._ask,
-            "similar": self._similar,
-            "parts": self._parts,
-            "save_selection": self._save_selection,
-            "save_edits": self._save_edits,
-        }
 
     def call(self, name: str, args: dict[str, Any], attached: bytes = b"") -> Answer:
         """Answer a call.
@@ -63,10 +56,10 @@ class Session:
         `edits` has a list for each side that was edited, in the form of `EditList.save`. Masks are of the cloud with its
         copies, before Gaussians are removed. A ValueError for an unknown call or wrong arguments.
         """
-        check_choice("name", name, list(self._calls))
+        check_choice("name", name, CALLS)
         with self._lock:
             try:
-                return self._calls[name](args, attached)
+                return getattr(self, f"_{name}")(args, attached)  # type: ignore[no-any-return]
             except (KeyError, AttributeError, TypeError) as error:
                 raise ValueError(
                     f"args: expected those of {name!r}, got {args!r:.80} ({error}); send what the page makes"
@@ -76,11 +69,11 @@ class Session:
         words = args["words"]
         if not isinstance(words, str) or not words.strip():
             raise ValueError(f"words: expected text, got {words!r:.80}; ask for a class or a phrase")
-        return _answer(self.state.meaning.ask(words))
+        return self.state.meaning.ask(words).packed()
 
     def _similar(self, _: dict[str, Any], attached: bytes) -> Answer:
         (mask,) = _masks({"semantic": len(self.state.cloud("semantic"))}, attached).values()
-        return _answer(self.state.meaning.similar(mask))
+        return self.state.meaning.similar(mask).packed()
 
     def _parts(self, args: dict[str, Any], attached: bytes) -> Answer:
         side = _side(args["side"])
@@ -105,7 +98,7 @@ class Session:
         return {"paths": [str(path) for path in save_selection(state, edited, masks, self.out)]}, b""
 
     def _save_edits(self, args: dict[str, Any], _: bytes) -> Answer:
-        made = {_side(side): edits for side in args["edits"] if len(edits := _edit_list(args, side))}
+        made = {_side(side): edits for side in args["edits"] if len(edits := _edits_of(args, side))}
         if not made:
             raise ValueError("edits: expected at least one, got none; remove or recolour something first")
         if args.get("lambda") is not None:
@@ -119,7 +112,7 @@ class Session:
 
     def _edited(self, side: Side, args: dict[str, Any]) -> Gaussians:
         """A side with what was done to it, but nothing removed: masks are of these Gaussians."""
-        kept = tuple(edit for edit in _edit_list(args, side) if edit.op != "remove")
+        kept = tuple(edit for edit in _edits_of(args, side) if edit.op != "remove")
         return EditList(kept).apply(labelled(self.state, side))
 
 
@@ -178,23 +171,13 @@ def next_folder(out: Path, stem: str) -> Path:
 
 def _masks(counts: dict[Side, int], attached: bytes) -> dict[Side, Tensor]:
     masks: dict[Side, Tensor] = {}
-    begin = 0
     for side, size in counts.items():
-        own = np.frombuffer(attached[begin : begin + -(-size // 8)], np.uint8)
-        begin += -(-size // 8)
-        if len(own) < -(-size // 8):
-            raise ValueError(
-                f"attached: expected {-(-size // 8)} bytes for {side!r}, got {len(own)}; load the page again"
-            )
+        length = -(-size // 8)
+        own, attached = np.frombuffer(attached[:length], np.uint8), attached[length:]
+        if len(own) < length:
+            raise ValueError(f"attached: expected {length} bytes for {side!r}, got {len(own)}; load the page again")
         masks[side] = torch.from_numpy(np.unpackbits(own, bitorder="little")[:size].astype(bool))
     return masks
-
-
-def _answer(asked: Asked) -> Answer:
-    known = asked.selection
-    scores = torch.where(asked.valid, known.scores, torch.nan).cpu().numpy().astype("<f4")
-    answer = {"words": asked.words, "gamma": known.threshold, "how": known.how}
-    return answer | {"low": asked.low, "high": asked.high}, scores.tobytes()
 
 
 def _side(name: str) -> Side:
@@ -202,10 +185,13 @@ def _side(name: str) -> Side:
     return name  # type: ignore[return-value]
 
 
-def _edit_list(args: dict[str, Any], side: str) -> EditList:
-    """The edits of a side, as the viewer sends them."""
-    given = args.get("edits", {}).get(_side(side), [])
+def edit_list(given: list[dict[str, Any]]) -> EditList:
+    """Edits as the viewer sends them."""
     for edit in given:
         check_choice("edits: op", edit["op"], EDITS)
         check_choice("edits: where", edit["where"]["kind"], ("index",))
     return EditList(read_edits(given))
+
+
+def _edits_of(args: dict[str, Any], side: str) -> EditList:
+    return edit_list(args.get("edits", {}).get(_side(side), []))

@@ -38,7 +38,7 @@ uniform vec4 pinhole;                           // fx, fy, cx, cy in pixels of t
 uniform vec2 size;
 uniform vec3 eye, paper;
 layout(location = 0) out uvec4 shape;           // centre x, y; two half-axes as pairs of half floats
-layout(location = 1) out uvec4 paint;           // rg, b and opacity as half floats; selected
+layout(location = 1) out uvec4 paint;           // rg, b and opacity as half floats; selected; depth
 
 const float UNKNOWN = -1e38;
 const vec3 GREY = vec3(128.0 / 255.0);
@@ -174,13 +174,13 @@ void main() {
     opacity = 1.0 - pow(1.0 - opacity, inversesqrt(share));
   }
   shape = uvec4(floatBitsToUint(xy), packHalf2x16(axis * sqrt(large)), packHalf2x16(vec2(-axis.y, axis.x) * sqrt(small)));
-  paint = uvec4(packHalf2x16(color.rg), packHalf2x16(vec2(color.b, opacity)), chosen ? 1u : 0u, 0u);
+  paint = uvec4(packHalf2x16(color.rg), packHalf2x16(vec2(color.b, opacity)), chosen ? 1u : 0u, floatBitsToUint(p.z));
 }`;
 
 export const SPLAT_VERTEX = `${HEAD}
 uniform usampler2D shapes, paints;
 uniform vec2 size;
-uniform float least;                            // alpha that is drawn
+uniform float least, near;                      // alpha that is drawn; depth
 uniform int first, end;                         // slots
 out vec2 at;
 flat out vec4 color;
@@ -199,7 +199,8 @@ void main() {
   chosen = float(paint.z);
   at = (vec2(gl_VertexID & 1, (gl_VertexID >> 1) & 1) * 2.0 - 1.0) * sqrt(2.0 * log(color.a / least));
   vec2 pixel = uintBitsToFloat(shape.xy) + at.x * unpackHalf2x16(shape.z) + at.y * unpackHalf2x16(shape.w);
-  gl_Position = vec4(pixel.x / size.x * 2.0 - 1.0, 1.0 - pixel.y / size.y * 2.0, 0.0, 1.0);
+  float depth = 1.0 - 2.0 * near / uintBitsToFloat(paint.w);  // as SOLID_VERTEX has it
+  gl_Position = vec4(pixel.x / size.x * 2.0 - 1.0, 1.0 - pixel.y / size.y * 2.0, depth, 1.0);
 }`;
 
 export const SPLAT_FRAGMENT = `${HEAD}
@@ -221,6 +222,33 @@ void main() {
 #endif
 }`;
 
+/** Points and meshes: drawn before the Gaussians, which their depth hides; seen through what the Gaussians leave free. */
+export const SOLID_VERTEX = `${HEAD}
+layout(location = 0) in vec3 place;
+layout(location = 1) in vec3 tone;
+uniform mat4 view;
+uniform vec4 pinhole;                           // fx, fy, cx, cy in pixels of the target
+uniform vec2 size;
+uniform float near, dotSize;
+out vec3 color, at;
+void main() {
+  color = tone;
+  at = (view * vec4(place, 1.0)).xyz;
+  vec2 pixel = (pinhole.xy * at.xy + pinhole.zw * at.z) / size * 2.0 - at.z;
+  gl_Position = vec4(pixel.x, -pixel.y, at.z - 2.0 * near, at.z);
+  gl_PointSize = dotSize;
+}`;
+
+export const SOLID_FRAGMENT = `${HEAD}
+in vec3 color, at;                              // at: in the camera's axes
+uniform bool meshed;
+out vec4 picture;
+void main() {
+  if (!meshed && length(gl_PointCoord - 0.5) > 0.5) discard;
+  vec3 normal = normalize(cross(dFdx(at), dFdy(at)));
+  picture = vec4(meshed ? color * (0.35 + 0.65 * abs(dot(normal, normalize(at)))) : color, 1.0);  // a lamp at the camera
+}`;
+
 /** Marks pixels that are covered completely, so that nothing behind is drawn there. */
 export const COVERED = `${HEAD}
 uniform sampler2D picture;
@@ -232,7 +260,7 @@ void main() {
 }`;
 
 export const FINISH = `${HEAD}
-uniform sampler2D picture, outline;
+uniform sampler2D picture, outline, solids;
 uniform vec4 viewport;                          // x, y from below, width, height on the canvas
 uniform vec3 paper;
 uniform vec3 rim;                               // colour of the outline
@@ -242,7 +270,8 @@ out vec4 color;
 void main() {
   vec2 at = (gl_FragCoord.xy - viewport.xy) / viewport.zw;
   vec4 seen = texture(picture, at);
-  vec3 rgb = seen.rgb + (1.0 - seen.a) * paper;
+  vec4 solid = texture(solids, at);
+  vec3 rgb = seen.rgb + (1.0 - seen.a) * mix(paper, solid.rgb, solid.a);
   if (width > 0.0) {
     float here = texture(outline, at).r, most = here, least = here;
     for (int k = 0; k < 8; k++) {

@@ -8,22 +8,35 @@ from typing import Any
 
 import numpy as np
 import torch
-from traitlets import Any as Anything
-from traitlets import Float, HasTraits, Unicode, observe, validate
+from traitlets import HasTraits, TraitType
 
-from .._check import check_choice, check_whole, class_indices
+from .._check import ORIGIN, as_array, check_choice, check_shapes, check_whole, class_indices
+from .._origin import recounted, to_world
+from .._rows import check_finite
 from ..cameras import Camera
 from ..gaussians import Gaussians
 from ..labels import EditList, Selection
-from ..labels.edit_list import read_edits
 from ..labels.edits import Edit
 from ..labels.selection import as_selection
 from .pack import pack_camera
-from .session import EDITS, labelled
+from .session import EDITS, edit_list, labelled
 from .state import Exploration, Picked, Side
 
 USUAL = ("scale", 1), ("mode", "tint")  # of edits that the browser does
-NAMES = ("question", "gamma", "distance", "hidden", "side", "selection", "edits", "picked", "camera")
+NAMES = ("question", "gamma", "distance", "hidden", "side", "selection", "edits", "picked", "tape", "camera")
+
+
+class Value(TraitType[Any, Any]):
+    """A trait that is set through the wire: what is read and observed is what the wire then says."""
+
+    def set(self, obj: Shared, value: Any) -> None:  # type: ignore[override]
+        """Set the value, unless it is the one that is read."""
+        if not _same(value, getattr(obj, str(self.name))):
+            obj.change(str(self.name), value)
+
+    def show(self, obj: Shared, value: Any) -> None:
+        """Give the trait what the wire says, and notify its observers."""
+        super().set(obj, value)
 
 
 class Shared(HasTraits):
@@ -32,25 +45,27 @@ class Shared(HasTraits):
     What is set here changes the wire, and the other way round; what is set before a browser shows the scene waits for it.
     """
 
-    question = Unicode(None, allow_none=True)
+    question = Value(None)
     """What is searched for, a class or a phrase; None: nothing."""
-    gamma = Float(None, allow_none=True)
+    gamma = Value(None)
     """The score that a selected Gaussian exceeds; None without a question. None sets what the question suggests."""
-    distance = Float(1.0)
+    distance = Value(None)
     """Lambda, world units: colour Gaussians closer than this to a semantic one take its label."""
-    hidden = Anything(())
+    hidden = Value(None)
     """Names of the classes that are not drawn; "no class" is one of them."""
-    side = Unicode()
+    side = Value(None)
     """The cloud that is shown, and that `selection` and `edits` are of: "semantic" or "color"."""
-    selection = Anything()
+    selection = Value(None)
     """A `Selection` of the Gaussians as they were given, without those that an edit removed. A class name, a
     rule like `InBox`, a mask [N] or None can be set, too; of another length than the cloud shown, it is of the other one, which
     is shown then."""
-    edits = Anything(EditList())
+    edits = Value(None)
     """The `EditList` of the cloud that is shown: `viewer.edits.apply(splat)`."""
-    picked = Anything(None)
+    picked = Value(None)
     """The picked Gaussian (`side, index, name, score, position`), or None. Its index can be set."""
-    camera = Anything(None)
+    tape = Value(None)
+    """The two ends of the measuring tape, places in the world, or None: `math.dist(*viewer.tape)` is the length."""
+    camera = Value(None)
     """The `Camera` that the picture is seen through. The name of a camera of the scene can be set."""
 
     def __init__(self, state: Exploration) -> None:
@@ -62,64 +77,37 @@ class Shared(HasTraits):
         self.wire: dict[str, Any] = {
             "format": "kfgs.view", "version": 1, "words": state.asked and state.asked.words, "gamma": state.gamma,
             "lambda": state.distance if "color" in sides else None, "hidden": [], "side": state.sides[-1], "picked": None,
-            "sides": sides, "view": {},
+            "tape": [], "sides": sides, "view": {},
         }  # fmt: skip
-        self._refresh(NAMES)
+        self._show(self._values(NAMES))
 
     def hear(self, told: dict[str, Any]) -> None:
-        """Take over what a person changed: parts of the wire."""
-        state, wire = self.state, self.wire | told
-        if wire["lambda"] is not None and np.float32(wire["lambda"]) != np.float32(state.distance):
-            state.set_distance(wire["lambda"])
-        if wire["words"] != (state.asked and state.asked.words):
-            state.ask(wire["words"])
-        if state.asked is not None and wire["gamma"] not in (None, state.gamma):
-            state.set_gamma(wire["gamma"])
-        # JavaScript rounds lambda to float32, and has a gamma without words after "like the selection"
-        self.wire = wire | {"lambda": wire["lambda"] and state.distance, "gamma": state.gamma}
-        self._refresh(("camera",) if told.keys() == {"view"} else NAMES)
+        """Take over what a person changed: parts of the wire. What cannot be read changes nothing, and is a ValueError."""
+        state, before, kept, wire = self.state, self.wire, vars(self.state).copy(), self.wire | told
+        try:
+            if wire["lambda"] is not None and np.float32(wire["lambda"]) != np.float32(state.distance):
+                state.set_distance(wire["lambda"])
+            if wire["words"] != (state.asked and state.asked.words):
+                state.ask(wire["words"])
+            if state.asked is not None and wire["gamma"] not in (None, state.gamma):
+                state.set_gamma(wire["gamma"])
+            # JavaScript rounds lambda to float32, and has a gamma without words after "like the selection"
+            self.wire = wire | {"lambda": wire["lambda"] and state.distance, "gamma": state.gamma}
+            values = self._values(("camera",) if told.keys() == {"view"} else NAMES)
+        except Exception as error:  # whatever an unknown form leads to
+            self.wire = before
+            vars(state).update(kept)
+            self.tell()  # the browser shows again what holds
+            raise ValueError(f"wire: expected what the viewer's script sends, got something else ({error})") from error
+        self._show(values)
 
     def tell(self) -> None:
         """Show the wire in the browser, if there is one."""
 
-    @validate(*NAMES)
-    def _checked(self, proposal: Any) -> Any:
-        """What is set, in the form in which it is read; an error if it cannot be set."""
-        name, value, state = proposal["trait"].name, proposal["value"], self.state
-        if name == "question" and value != self.wire["words"]:
-            return state.meaning.ask(value).words if value and value.strip() else None
-        if name == "gamma" and value != state.gamma:
-            state.set_gamma(value)
-            return state.gamma
-        if name == "distance" and value != state.distance:
-            state.set_distance(value)
-        if name == "side":
-            check_choice("side", value, state.sides)
-        if name == "hidden":
-            names = [value] if isinstance(value, str) else list(value or ())
-            return tuple(state.class_name(label) for word in names for label in self._labels(word)[:1])
-        if name == "camera" and not isinstance(value, Camera | None):
-            check_choice("camera", value, known := {camera.name: camera for camera in state.cameras})
-            return known[value]
-        if name == "picked" and not isinstance(value, Picked | None):
-            check_whole("picked", value, 0, len(state.cloud(self.side)) - 1)
-            return state.describe(self.side, value)
-        if name == "edits" and not isinstance(value, EditList):
-            return EditList(value or ())
-        if name == "selection":
-            return as_selection(value, labelled(state, self.side))
-        return value
-
-    @observe(*NAMES)
-    def _changed(self, change: Any) -> None:
-        """Write a value that somebody set into the wire; those that the browser changed are there already."""
-        name, value = change["name"], change["new"]
-        if _same(value, self._read(name)):
-            return
-        try:
-            self.wire = self.wire | self._written(name, value)
-        finally:  # if it is refused, the value of before comes back
-            self._refresh(NAMES)
+    def change(self, name: str, value: Any) -> None:
+        """Write a value that somebody set into the wire; an error if it cannot be set."""
+        self.wire = self.wire | self._written(name, value)
+        self._show(self._values(NAMES))
         self.tell()
 
     def _written(self, name: str, value: Any) -> dict[str, Any]:
@@ -127,12 +115,22 @@ class Shared(HasTraits):
         wire, state = self.wire, self.state
         no_hand = {side: own | {"selected": None} for side, own in wire["sides"].items()}
         if name == "question":
+            if not isinstance(value, str | None):
+                raise TypeError(f"question: expected words, got {value!r:.80}; ask for a class or a phrase")
             state.ask(value)
-        if name == "gamma" and value is None and state.asked is not None:
+        if name == "gamma" and value is not None:
+            state.set_gamma(value)
+        elif name == "gamma" and state.asked is not None:
             state.ask(state.asked.words)
         if name in ("question", "gamma"):
             return {"words": state.asked and state.asked.words, "gamma": state.gamma, "sides": no_hand}
+        if name == "distance":
+            state.set_distance(value)
+            return {"lambda": state.distance}
+        if name == "side":
+            check_choice("side", value, state.sides)
         if name == "selection":
+            value = None if value is None else as_selection(value, labelled(state, self.side))
             if value is None or not len(value):
                 state.ask(None)
                 return {"words": None, "gamma": None, "sides": no_hand}
@@ -145,23 +143,43 @@ class Shared(HasTraits):
             bits = base64.b64encode(np.packbits(value.mask.cpu().numpy(), bitorder="little").tobytes()).decode()
             return {"side": side, "sides": no_hand | {side: no_hand[side] | {"selected": bits}}}
         if name == "edits":
-            own = wire["sides"][self.side] | {"edits": _numbered(value or (), labelled(state, self.side))}
+            edits = value if isinstance(value, EditList) else EditList(value or ())
+            own = wire["sides"][self.side] | {"edits": _numbered(edits, labelled(state, self.side))}
             return {"sides": wire["sides"] | {self.side: own}}
         if name == "hidden":
-            return {"hidden": sorted({label for word in value or () for label in self._labels(word)})}
+            words = [value] if isinstance(value, str) else list(value or ())
+            known = state.meaning.names
+            labels = [(-1,) if word == state.class_name(-1) else class_indices(word, known) for word in words]
+            return {"hidden": sorted({label for own in labels for label in own})}
         if name == "picked":
-            return {"picked": value and {"side": value.side, "index": value.index}}
+            if value is None or isinstance(value, Picked):
+                return {"picked": value and {"side": value.side, "index": value.index}}
+            check_whole("picked", value, 0, len(state.cloud(self.side)) - 1)
+            return {"picked": {"side": self.side, "index": int(value)}}
+        if name == "tape":
+            ends = torch.zeros(0, 3) if value is None else torch.from_numpy(as_array(value, "tape").astype(np.float64))
+            check_shapes(("tape", ends, ("N" if value is None else 2, 3)))
+            check_finite("tape", ends)
+            return {"tape": recounted(ends, ORIGIN, state.cloud("semantic").origin).tolist()}
         if name == "camera":
+            if not isinstance(value, Camera | None):
+                check_choice("camera", value, cameras := {camera.name: camera for camera in state.cameras})
+                value = cameras[value]
             return {"view": pack_camera(value.with_origin(state.cloud("semantic").origin)) if value else {}}
-        return {"lambda" if name == "distance" else name: value}
+        return {name: value}
 
-    def _refresh(self, names: Iterable[str]) -> None:
-        """Give values what the wire says."""
+    def _values(self, names: Iterable[str]) -> dict[str, Any]:
+        """What the wire says; an error if it cannot be read."""
+        for side in self.state.sides:
+            check_choice("count", self.wire["sides"][side]["count"], [len(self.state.cloud(side))])
+            edit_list(self.wire["sides"][side]["edits"])
+        return {name: self._read(name) for name in names}
+
+    def _show(self, values: dict[str, Any]) -> None:
         with self.hold_trait_notifications():
-            for name in names:
-                value = self._read(name)
+            for name, value in values.items():
                 if not _same(getattr(self, name), value):
-                    self.set_trait(name, value)
+                    self.traits()[name].show(self, value)
 
     def _read(self, name: str) -> Any:
         state, wire = self.state, self.wire
@@ -169,14 +187,22 @@ class Shared(HasTraits):
         if name == "distance":
             return wire["lambda"] or state.distance
         if name == "hidden":
+            for label in wire["hidden"]:
+                check_whole("hidden", label, -1, len(state.meaning.names) - 1)
             return tuple(state.class_name(label) for label in wire["hidden"])
         if name == "edits":
-            return EditList(read_edits(own["edits"]))
+            return edit_list(own["edits"])
         if name == "selection":
             return self._selection(wire["side"], own)
-        if name == "picked":
-            at = wire["picked"]  # what is known of a copy is known in the browser only
-            return at and (state.describe(**at) if at["index"] < wire["sides"][at["side"]]["count"] else None)
+        if name == "tape":
+            ends = torch.tensor(wire["tape"], dtype=torch.float64).reshape(-1, 3)
+            check_finite("tape", ends)
+            world = to_world(ends, state.cloud("semantic").origin).tolist()
+            return tuple(map(tuple, world)) if len(world) == 2 else None
+        if name == "picked" and (at := wire["picked"]) is not None:
+            check_whole("picked", at["index"], 0)
+            known = at["index"] < wire["sides"][at["side"]]["count"]  # of a copy, the browser alone knows more
+            return state.describe(at["side"], at["index"]) if known else None
         if name == "camera":
             if not wire["view"]:
                 return state.cameras[0] if state.cameras else None
@@ -191,7 +217,7 @@ class Shared(HasTraits):
     def _selection(self, side: Side, own: dict[str, Any]) -> Selection:
         state, asked = self.state, self.state.asked
         if any(other["selected"] is not None for other in self.wire["sides"].values()):
-            bits = np.frombuffer(base64.b64decode(own["selected"] or b""), np.uint8)
+            bits = np.frombuffer(base64.b64decode(own["selected"] or b"", validate=True), np.uint8)
             mask = np.unpackbits(bits, count=own["count"], bitorder="little").astype(bool)
             made = Selection.of(mask, "by hand")
         elif asked is None:
@@ -202,10 +228,6 @@ class Shared(HasTraits):
         removed = [i for edit in own["edits"] if edit["op"] == "remove" for i in edit["where"]["indices"]]
         made.mask[[i for i in removed if i < own["count"]]] = False
         return made
-
-    def _labels(self, name: str) -> tuple[int, ...]:
-        """The labels of a class; -1 for "no class"."""
-        return (-1,) if name == self.state.class_name(-1) else class_indices(name, self.state.meaning.names)
 
 
 def _numbered(edits: Iterable[Edit], cloud: Gaussians) -> list[dict[str, Any]]:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import numbers
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -84,15 +83,11 @@ class Exploration:
         self._own_labels = as_array(semantic.labels).astype(np.int64)
         self.source, self.far, suggested, self.distance_how = self._find_sources()
         self._base: dict[Side, Array] = {}
-        colored = any(cloud.sh is not None for cloud in self._clouds.values())
-        shows: dict[Show, bool] = {
-            "labels": True,
-            "rgb": colored,
-            "latents": semantic.features is not None,
-            "score": True,
-        }
-        self.show_choices = tuple(show for show, possible in shows.items() if possible)
+        colorless = all(cloud.sh is None for cloud in self._clouds.values())
+        absent: dict[Show, bool] = {"rgb": colorless, "latents": semantic.features is None}
+        self.show_choices: tuple[Show, ...] = tuple(show for show in get_args(Show) if not absent.get(show))
         self.show: Show = "labels"
+        self.things: dict[str, dict[str, Any]] = {}  # what a page shows as well, by name (`pack_thing`)
         self.asked: Asked | None = None
         self.gamma: float | None = None
         self.gamma_how = ""
@@ -117,7 +112,6 @@ class Exploration:
         """Select the Gaussians that score above gamma; a ValueError without a question, or out of `gamma_range`."""
         if self.asked is None:
             raise ValueError(f"gamma: expected a question that it applies to, got none (gamma {gamma!r}); ask first")
-        check_number("gamma", gamma)
         low, high = self.gamma_range
         slack = 1e-6 * max(high - low, abs(low), abs(high))  # a slider rounds to float32
         check_range("gamma", gamma, low - slack, high + slack)
@@ -125,7 +119,6 @@ class Exploration:
 
     def set_distance(self, distance: float) -> None:
         """Set lambda: colour Gaussians closer than this to a semantic one take its label. In world units, positive."""
-        check_number("distance", distance)
         check_range("distance", distance, 0, closed=(False, False))
         self.distance, self.distance_how = float(distance), "given"
 
@@ -272,9 +265,3 @@ class Exploration:
             return own
         reached = np.less(self.far, self.distance)
         return np.where(reached.reshape(-1, *[1] * (own.ndim - 1)), own[self.source], nothing).astype(own.dtype)
-
-
-def check_number(name: str, value: object) -> None:
-    """Raise a TypeError unless `value` is a number and not a bool."""
-    if not isinstance(value, numbers.Real) or isinstance(value, bool):
-        raise TypeError(f"{name}: expected a number, got {value!r} ({type(value).__name__}); pass a float")

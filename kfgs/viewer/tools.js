@@ -12,11 +12,12 @@ export class Tools {
    * @param {HTMLElement} stage what the pointer works on
    * @param {Eye} eye the camera
    * @param {{moved(), click(x, y), twice(x, y), shape(polygon, how),
-   *   brush(x, y, how, first), brushSize(), shift(dx, dy, upward, first)}} on places are CSS pixels of the stage; `how`:
+   *   brush(x, y, how, first), shift(dx, dy, upward, first)}} on places are CSS pixels of the stage; `how`:
    *   replace, add, subtract
    */
   constructor(stage, eye, on) {
     Object.assign(this, { stage, eye, on, tool: "move", points: new Map(), how: "replace", keys: new Set(), drag: null });
+    this.radius = 24; // of the brush, pixels
     this.overlay = svg("svg", { class: "overlay", "aria-hidden": "true" });
     stage.append(this.overlay);
     const listen = (name, handler) => stage.addEventListener(name, handler.bind(this), { passive: false });
@@ -51,7 +52,7 @@ export class Tools {
     const place = this.place(event);
     this.points.set(event.pointerId, place);
     if (this.points.size > 1) return this.cancelShape();
-    const selects = this.tool !== "move" && event.button === 0;
+    const selects = this.tool !== "move" && this.tool !== "tape" && event.button === 0;
     const looks = event.button === 1 || (event.button === 0 && (event.ctrlKey || event.metaKey));
     const kind = selects ? this.tool : looks ? "look" : event.button === 0 && !event.shiftKey ? "orbit" : "pan";
     const how = event.altKey ? "subtract" : event.shiftKey ? "add" : this.how;
@@ -61,7 +62,7 @@ export class Tools {
 
   move(event) {
     const place = this.place(event);
-    if (this.tool === "brush" && !this.points.size) this.circle(place, this.on.brushSize());
+    if (this.tool === "brush" && !this.points.size) this.circle(place, this.radius);
     if (!this.points.has(event.pointerId)) return;
     if (this.points.size === 2) return this.pinch(event.pointerId, place);
     this.points.set(event.pointerId, place);
@@ -76,7 +77,7 @@ export class Tools {
     if (["orbit", "pan", "look"].includes(drag.kind)) {
       if (drag.far < CLICK) return;
       if (drag.kind === "pan") eye.pan(dx, dy);
-      else if (drag.kind === "look" || this.flying || eye.loose) eye.turn(dx, dy);
+      else if (drag.kind === "look" || this.keys.size || eye.loose) eye.turn(dx, dy);
       else eye.orbit(dx, dy);
       this.on.moved();
     } else if (drag.kind === "brush") this.paint(place, false);
@@ -130,7 +131,7 @@ export class Tools {
   }
 
   paint(place, first) {
-    this.circle(place, this.on.brushSize());
+    this.circle(place, this.radius);
     this.on.brush(...place, this.drag.how, first);
   }
 
@@ -140,10 +141,6 @@ export class Tools {
 
   outline(path) {
     this.overlay.replaceChildren(svg("polygon", { points: path.map((one) => one.join(",")).join(" ") }));
-  }
-
-  get flying() {
-    return this.keys.size > 0;
   }
 
   /** A key went down; true if it moves the camera. */

@@ -12,26 +12,27 @@ from pathlib import Path
 from threading import Event
 from typing import TYPE_CHECKING, Any, Literal
 
-import torch
 from torch import Tensor
 
 from .._check import check_choice
+from .._files import atomic_path
 from ..cameras import Camera
 from ..fields import SemanticField
 from ..gaussians import Gaussians
 from ..labels import LabelSet
 from ..labels.transfer import as_cloud
 from ..scenes import Scene
-from ..splat import rasterize
-from ..viz.pictures import as_bytes
+from ..viz.films import show_cloud
+from ..viz.pictures import check_suffix
 from ..viz.plotter import has_display
 from .meaning import FieldMeaning, Meaning, SplatMeaning
 from .pack import as_jpeg, pack_scene
-from .page import APP, document, inline_script, read_text, save_html
+from .page import APP, document, inline_script, read_text
 from .server import PageServer, answer_call, pack_message
 from .session import Session
 from .shared import Shared
 from .state import Exploration
+from .things import pack_thing
 from .window import Explorer
 
 if TYPE_CHECKING:
@@ -40,23 +41,6 @@ if TYPE_CHECKING:
 Where = Literal["auto", "window", "browser", "notebook", "picture"]
 STILL = 800  # pixels: the longer edge of the picture where widgets cannot run
 PALE = 0.6  # share of white in the grey of what a question did not select
-START = """
-export default {
-  async render({ model, el }) {
-    const root = document.createElement("div");
-    root.style.height = `${model.get("height")}px`;
-    root.dataset.lmSuppressShortcuts = "true"; // JupyterLab's keys would act on cells
-    el.append(root);
-    const raw = model.get("data");
-    const bytes = new Uint8Array(raw.buffer, raw.byteOffset, raw.byteLength);
-    const header = model.get("header");
-    const packed = { header, data: await kfgs.inflate(bytes, header) };
-    const app = await kfgs.mount(root, packed, new kfgs.PythonLink(kfgs.callWidget(model), packed));
-    const end = await kfgs.share(app, model);
-    return () => (end(), app.dispose());
-  },
-};
-"""
 
 
 def explore(
@@ -124,8 +108,8 @@ def explore(
 class Viewer(Shared):
     """The WebGL viewer of an exploration. As the last value of a notebook's cell it is a widget.
 
-    `question`, `gamma`, `distance`, `hidden`, `side`, `selection`, `edits`, `picked` and `camera` are what a person sees in
-    the widget. Set one, and the widget shows it, also if it is drawn later; `viewer.observe(act, "selection")` calls
+    `question`, `gamma`, `distance`, `hidden`, `side`, `selection`, `edits`, `picked`, `tape` and `camera` are what a person sees
+    in the widget. Set one, and the widget shows it, also if it is drawn later; `viewer.observe(act, "selection")` calls
     `act(change)` when one changes (traitlets). A page of its own opens with the state's question, gamma, lambda and colours;
     after that, page and Python are independent. `scene` has the photos of the cameras, found by name; `out` is the folder for
     files, on the machine of this program; `height` of the widget is in CSS pixels.
@@ -149,14 +133,38 @@ class Viewer(Shared):
 
     def ask(self, words: str | None) -> None:
         """Set `question`: search for a class or a phrase; None clears the search. A selection by hand goes."""
-        self.question = None  # else the same words again would change nothing
-        self.question = words
+        self.change("question", words)
+
+    def add(self, name: str, thing: Any, *, color: Any = None) -> None:
+        """Show something with the scene: in the widget at once, in a page and an exported file that are made afterwards.
+
+        Points and meshes are hidden by Gaussians in front of them, and hide those behind; boxes and labels stand over
+        the picture. Places are in the world.
+
+        Args:
+            name: its name; a thing of this name is replaced.
+            thing: points [N, 3]; a mesh, of pyvista (`PolyData`) or with `vertices` and `faces` (trimesh); `Part`, `OrientedBox`
+                or a list of them; or one place [3], where the name is written.
+            color: of points or a mesh: "#c04040", a CSS name, or [N, 3], bytes or in [0, 1]. None: its own, or blue.
+
+        Raises:
+            ValueError, TypeError: if it cannot be shown.
+        """
+        self.state.things[str(name)] = pack_thing(thing, color, self.state.cloud("semantic").origin)
+        self.tell()
+
+    def remove(self, name: str) -> None:
+        """Show something no more that was added; a ValueError if nothing has this name."""
+        check_choice("name", name, self.state.things)
+        del self.state.things[name]
+        self.tell()
 
     def tell(self) -> None:
         """Show in the widget what was set; it does so by itself."""
         if self._widget is not None:
             wire = {part: value for part, value in self.wire.items() if part != "view"}
             self._widget.wire, self._widget.view = wire, self.wire["view"]  # a moving camera sends the second alone
+            self._widget.things = dict(self.state.things)
 
     def serve(self, host: str = "127.0.0.1", port: int = 0, *, report: Callable[[str], object] | None = None) -> None:
         """Open the page in the browser, and serve it until Ctrl-C.
@@ -190,25 +198,17 @@ class Viewer(Shared):
 
         Classes can be searched, gamma and lambda changed, Gaussians selected and edited. New phrases need Python.
         """
-        return save_html(self.state, path, title=self.title, scene=self.scene)
+        target = check_suffix(path, ".html")
+        with atomic_path(target) as temporary:
+            packed = pack_scene(self.state, title=self.title, scene=self.scene)
+            temporary.write_text(document(self.title, packed), encoding="utf-8")
+        return target
 
     @property
     def widget(self) -> AnyWidget:
         """The notebook widget (anywidget), made when it is first wanted. Where widgets cannot run, it is a picture."""
-        if self._widget is None:
-            self._make_widget()
-        made: AnyWidget = self._widget
-        return made
-
-    def close(self) -> None:
-        """Close the widget, if there is one."""
         if self._widget is not None:
-            self._widget.close()
-
-    def _repr_mimebundle_(self, **options: Any) -> Any:
-        return self.widget._repr_mimebundle_(**options)
-
-    def _make_widget(self) -> None:
+            return self._widget
         require_widget()
         import anywidget
         import traitlets
@@ -217,12 +217,13 @@ class Viewer(Shared):
         packed = pack_scene(state, title=self.title, scene=self.scene)
 
         class Widget(anywidget.AnyWidget):  # type: ignore[misc]
-            _esm = inline_script(APP) + START
+            _esm = inline_script(APP) + "export default { render: kfgs.startWidget };\n"
             _css = read_text("app.css")
             header = traitlets.Dict().tag(sync=True)
             data = traitlets.Bytes().tag(sync=True)
             wire = traitlets.Dict().tag(sync=True)
             view = traitlets.Dict().tag(sync=True)
+            things = traitlets.Dict().tag(sync=True)
             height = traitlets.Int().tag(sync=True)
 
             def _repr_mimebundle_(self, **options: Any) -> Any:
@@ -232,17 +233,26 @@ class Viewer(Shared):
                     bundle["image/jpeg"] = still(state)
                 return made
 
-        self._widget = widget = Widget(header=packed.header, data=packed.compressed(), height=self.height)
+        header = packed.header | {"things": {}}  # they have a trait of their own
+        self._widget = widget = Widget(header=header, data=packed.compressed(), height=self.height)
         self.tell()
         widget.observe(lambda change: self.hear(change["new"]), "wire")
         widget.observe(lambda change: self.hear({"view": change["new"]}), "view")
 
         def answer(_: Any, message: Any, buffers: list[Any]) -> None:
-            attached = bytes(buffers[0]) if buffers else b""
-            answered, more = answer_call(session.call, lambda: (message, attached))
+            answered, more = answer_call(session.call, lambda: (message, b"".join(buffers)))
             widget.send({"id": message.get("id"), "answer": answered}, [more])
 
         widget.on_msg(answer)
+        return widget
+
+    def close(self) -> None:
+        """Close the widget, if there is one."""
+        if self._widget is not None:
+            self._widget.close()
+
+    def _repr_mimebundle_(self, **options: Any) -> Any:
+        return self.widget._repr_mimebundle_(**options)
 
 
 def require_widget() -> None:
@@ -261,13 +271,11 @@ def in_notebook() -> bool:
 def still(state: Exploration) -> str:
     """What the first camera sees, a JPEG file in base64, as notebooks hold it; what a question did not select is pale."""
     side, camera = state.sides[-1], state.cameras[0].fitted(STILL)
-    cloud = state.cloud(side)
-    if state.asked is not None or state.show != "rgb" or cloud.sh is None:
-        colors = torch.from_numpy(state.colors(side)).to(cloud.means) / 255
-        if state.asked is not None:
-            rest = ~torch.from_numpy(state.selected(side)).to(colors.device)
-            colors[rest] = PALE + (1 - PALE) * colors[rest].mean(dim=1, keepdim=True)
-        cloud = cloud.replace(features=colors, sh=None)
-    with torch.no_grad():
-        picture = as_bytes(rasterize(cloud.replace(labels=None), camera, background=cloud.means.new_ones(3)).map)
-    return base64.b64encode(as_jpeg(picture)).decode("ascii")
+    cloud, colors = state.cloud(side), state.colors(side)
+    if state.asked is not None:
+        rest = ~state.selected(side)
+        colors = colors.copy()  # the state keeps its own
+        colors[rest] = 255 * PALE + (1 - PALE) * colors[rest].mean(axis=1, keepdims=True)
+    own = state.asked is None and state.show == "rgb" and cloud.sh is not None
+    draw = show_cloud(cloud, color_by="rgb" if own else colors)
+    return base64.b64encode(as_jpeg(draw(camera))).decode("ascii")

@@ -18,8 +18,7 @@ from PIL import Image
 from kfgs.cameras import Camera
 from kfgs.labels import EditList
 from kfgs.labels.edit_list import read_edits
-from kfgs.viewer import Exploration, FieldMeaning, SplatMeaning
-from kfgs.viewer.page import save_html
+from kfgs.viewer import Exploration, FieldMeaning, SplatMeaning, Viewer
 
 pytestmark = needs_chromium
 SIDES = "color", "semantic"
@@ -34,7 +33,11 @@ def state():
 
 @pytest.fixture(scope="module")
 def file(state, tmp_path_factory):
-    return save_html(state, tmp_path_factory.mktemp("page") / "heaps.html", title="Three <heaps>")
+    return save_html(state, tmp_path_factory.mktemp("page") / "heaps.html")
+
+
+def save_html(state, path):
+    return Viewer(state, title="Three <heaps>").save_html(path)
 
 
 @pytest.fixture
@@ -335,6 +338,32 @@ def test_tools_take_what_is_seen_and_with_a_key_what_is_behind_it(browser, tmp_p
         painted = np.flatnonzero(mask(page, "semantic"))
         assert len(painted) > 1
         assert (painted < near).all()
+
+
+def test_two_clicks_measure_what_is_seen(browser, tmp_path):
+    _, state = walls()
+    for page in show(browser, save_html(state, tmp_path / "walls.html")):
+        x, y, width, height = page.locator(".stage").bounding_box().values()
+        page.keyboard.press("6")
+        page.mouse.click(x + 0.5 * width, y + 0.5 * height)  # through the hole to the far wall
+        assert "tape" not in page.locator(".said").inner_text()
+        page.mouse.click(x + 0.36 * width, y + 0.5 * height)
+        focal, cx, _ = page.evaluate("[viewer.panes.camera.fx, viewer.panes.camera.cx, 0]")
+        slope = (0.36 * page.evaluate("viewer.canvas.width") - cx) / focal
+        ends = np.array(page.evaluate("viewer.model.tape"))
+        np.testing.assert_allclose(ends, [[0, 0, 8], [4 * slope, 0, 4]], atol=0.02)  # on the walls, under the pointer
+        length = np.linalg.norm(ends[1] - ends[0])
+        assert f"The tape is {length:.3g} world units long" in page.locator(".said").inner_text()
+        page.evaluate("viewer.settled()")
+        assert page.locator(".boxes text").inner_html() == f"{length:.3g}"
+        saved = page.evaluate("viewer.state()")
+        drag(page, 100, 0)  # turns the view
+        page.keyboard.press("Escape")
+        assert page.evaluate("[viewer.model.tape.length, viewer.tools.tool]") == [0, "tape"]
+        open_state(page, tmp_path, saved)
+        until(page, lambda tab: tab.evaluate("viewer.model.tape.length") == 2)
+        page.mouse.click(x + 0.36 * width, y + 0.5 * height)  # a third one begins anew
+        assert page.evaluate("viewer.model.tape.length") == 1
 
 
 def drag(page, dx, dy):

@@ -26,7 +26,7 @@ WIDGET = """async ({script, style, values}) => {
     set: (name, value) => (state[name] = value),
     save_changes: () => {},
     send: async (message, _, buffers) => {
-      const [answer, attached] = await python(JSON.stringify(message), encode(new Uint8Array(buffers[0])));
+      const [answer, attached] = await python(JSON.stringify(message), buffers.map(encode));
       handlers["msg:custom"].forEach((handler) => handler(answer, [new DataView(decode(attached).buffer)]));
     },
   };
@@ -58,13 +58,13 @@ def in_widget(page, state, out):
     def python(message, attached):
         sent = []
         widget.send = lambda *found: sent.append(found)
-        widget._handle_custom_msg(json.loads(message), [base64.b64decode(attached)])
+        widget._handle_custom_msg(json.loads(message), [base64.b64decode(part) for part in attached])
         ((answer, (more,)),) = sent
         return answer, base64.b64encode(more).decode()
 
     page.expose_function("python", python)
     page.set_content("<body></body>")
-    values = {name: getattr(widget, name) for name in ("header", "wire", "view", "height")}
+    values = {name: getattr(widget, name) for name in ("header", "wire", "view", "things", "height")}
     values["data"] = base64.b64encode(widget.data).decode()
     page.evaluate(WIDGET, {"script": str(widget._esm), "style": str(widget._css), "values": values})
     yield

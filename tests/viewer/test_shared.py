@@ -1,6 +1,7 @@
 """What Python reads, sets and observes of a viewer, without a browser; with one: test_lab.py."""
 
 import base64
+import math
 
 import cases_explorer
 import cases_page
@@ -14,7 +15,7 @@ from kfgs.gaussians import Gaussians
 from kfgs.labels import Duplicate, EditList, InBox, Move, OfClass, Opacity, Recolor, Remove, Selection
 from kfgs.viewer import Exploration, SplatMeaning, Viewer
 
-NAMES = "question", "gamma", "distance", "hidden", "side", "selection", "edits", "picked", "camera"
+NAMES = "question", "gamma", "distance", "hidden", "side", "selection", "edits", "picked", "tape", "camera"
 
 
 @pytest.fixture
@@ -118,6 +119,70 @@ def test_a_person_is_heard_and_observers_are_told_once(viewer):
     assert (viewer.picked.side, viewer.picked.name) == ("semantic", "table")
     heard(viewer, picked={"side": "color", "index": 999})  # a copy, which Python does not know
     assert viewer.picked is None
+
+
+def test_observers_get_what_is_read(viewer):
+    viewer.ask("chair")
+    suggested, seen = viewer.gamma, []
+    viewer.observe(lambda change: seen.append((change["name"], change["new"])), list(NAMES))
+    settings = [
+        ("gamma", 0.5), ("gamma", None), ("hidden", "table"), ("picked", 7), ("tape", torch.eye(3)[:2]),
+        ("edits", [Opacity("chair", 0.5)]), ("selection", OfClass("table")), ("selection", None), ("camera", None),
+    ]  # fmt: skip
+    for name, value in settings:
+        seen.clear()
+        setattr(viewer, name, value)
+        for other, new in seen:
+            assert repr(new) == repr(getattr(viewer, other))
+        assert len(dict(seen)) == len(seen)  # each once
+        assert (name in dict(seen)) == (name != "camera")  # of which there is none before and after
+    assert (viewer.gamma, viewer.question, len(viewer.selection)) == (None, None, 0)
+    viewer.ask("chair")
+    assert viewer.gamma == suggested
+    viewer.selection = torch.arange(450) < 5
+    viewer.gamma = suggested  # as a slider echoes it
+    assert len(viewer.selection) == 5
+
+
+WRONG = [
+    {"words": "lamp"}, {"words": 5}, {"words": "chair", "gamma": "high"}, {"lambda": -1.0}, {"lambda": "far"}, {"hidden": [3]},
+    {"hidden": 7}, {"side": "left"}, {"sides": {}}, {"picked": {"side": "color", "index": -1}}, {"view": {"K": [1]}},
+    {"tape": [[0, 1]]}, {"tape": [[0, 1, float("nan")]] * 2}, {"color": {"count": 9}}, {"color": {"selected": "?"}},
+    {"color": {"edits": [{"op": "explode"}]}}, {"semantic": {"edits": [{"op": "remove", "where": "chair"}]}},
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("told", WRONG)
+def test_what_is_not_of_the_viewers_script_is_refused_as_a_whole(viewer, told):
+    viewer.ask("chair")
+    side = next((own for own in told if own in viewer.state.sides), None)
+    if side:
+        sides = viewer.wire["sides"]
+        told = {"sides": sides | {side: sides[side] | told[side]}}
+    if "view" not in told:  # what comes with it is not taken over, either
+        told = {"gamma": 0.5, "lambda": 0.3, "tape": [[0, 0, 0], [1, 1, 1]], "hidden": [0]} | told
+    before = viewer.wire, repr([getattr(viewer, name) for name in NAMES]), viewer.state.details()
+    seen, shown = [], []
+    viewer.observe(seen.append, list(NAMES))
+    viewer.tell = lambda: shown.append(viewer.wire)
+    refused(lambda: heard(viewer, **told), "wire:", "expected what the viewer's script sends")
+    assert before == (viewer.wire, repr([getattr(viewer, name) for name in NAMES]), viewer.state.details())
+    assert (seen, shown) == ([], [viewer.wire])  # the browser shows again what holds
+
+
+def test_the_tape_has_two_ends_in_the_world():
+    cloud = cases_page.exploration().cloud("color").replace(origin=(1000.0, 0, 0))
+    viewer = Viewer(Exploration(SplatMeaning(cloud)))
+    heard(viewer, tape=[[1, 2, 3]])
+    assert viewer.tape is None
+    heard(viewer, tape=[[1, 2, 3], [1, 2, 7]])
+    assert viewer.tape == ((1001, 2, 3), (1001, 2, 7))
+    assert math.dist(*viewer.tape) == 4
+    viewer.tape = np.array([[1000, 0, 0], [1003, 4, 0]])
+    assert viewer.wire["tape"] == [[0, 0, 0], [3, 4, 0]]
+    refused(lambda: setattr(viewer, "tape", [[0, 0, 0]]), "tape:", "[2, 3]", "(1, 3)")
+    viewer.tape = None
+    assert (viewer.tape, viewer.wire["tape"]) == (None, [])
 
 
 def cases_page_sides(viewer):
