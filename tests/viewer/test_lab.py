@@ -17,6 +17,7 @@ from cases_web import SECONDS, needs_chromium
 from kfgs.formats import write_splats
 
 pytest.importorskip("jupyterlab")
+nbformat = pytest.importorskip("nbformat")
 anywidget = pytest.importorskip("anywidget")
 pytestmark = needs_chromium
 
@@ -50,10 +51,10 @@ def jupyter(folder, kind="lab"):
     env = os.environ | places | {"JUPYTER_PATH": str(shared)}
     options = [
         f"--port={port}",
+        f"--ServerApp.root_dir={folder}",
         "--no-browser",
         "--allow-root",
         "--IdentityProvider.token=",
-        f"--ServerApp.root_dir={folder}",
     ]
     with open(folder / "log", "w") as log:
         server = subprocess.Popen([sys.executable, "-m", "jupyter", kind, *options], env=env, stdout=log, stderr=log)
@@ -71,22 +72,6 @@ def jupyter(folder, kind="lab"):
     finally:
         server.terminate()
         server.wait(60)
-
-
-def write_notebook(path, cells):
-    code = [
-        {
-            "cell_type": "code",
-            "id": f"c{i}",
-            "metadata": {},
-            "source": text.strip(),
-            "outputs": [],
-            "execution_count": None,
-        }
-        for i, text in enumerate(cells)
-    ]
-    kernel = {"name": "python3", "display_name": "Python 3", "language": "python"}
-    path.write_text(json.dumps({"cells": code, "metadata": {"kernelspec": kernel}, "nbformat": 4, "nbformat_minor": 5}))
 
 
 class Lab:
@@ -139,7 +124,9 @@ def test_the_widget_talks_back(browser, tmp_path):
     for side in state.sides:
         splats = state.cloud(side)
         write_splats(splats.replace(names=state.meaning.names if side == "semantic" else ()), tmp_path / f"{side}.ply")
-    write_notebook(tmp_path / "n.ipynb", CELLS)
+    kernel = {"kernelspec": {"name": "python3", "display_name": "Python 3"}}
+    cells = [nbformat.v4.new_code_cell(text.strip()) for text in CELLS]
+    nbformat.write(nbformat.v4.new_notebook(cells=cells, metadata=kernel), tmp_path / "n.ipynb")
     state.ask("chair")
     state.set_gamma(0.5)
     page = browser.new_page(viewport={"width": 1300, "height": 1500})
@@ -188,6 +175,11 @@ def test_the_widget_talks_back(browser, tmp_path):
         page.keyboard.press("Control+z")
         lab.until(lambda: lab.browser("model.counts('color').total"), 450)
         lab.until(lambda: lab.python("len(viewer.edits)"), 0)
+        # a thing that Python adds, and the tape
+        lab.python("viewer.add('points', splat.means)")
+        lab.until(lambda: lab.browser("panes.renderer.solids.map(({ points }) => points)"), [450])
+        lab.python("setattr(viewer, 'tape', [[0, 0, 0], [3, 4, 0]])")
+        lab.until(lambda: lab.browser("model.length"), 5)
         # the camera
         before = lab.python("viewer.camera.viewmat.tolist()")
         page.locator(".kfgs .stage").focus()

@@ -5,12 +5,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from cases_explorer import classes as few_classes
-from cases_explorer import cloud, field, grid, line
+from cases_explorer import cloud, line
 from cases_web import room_state
 from messages import refused
 
-from kfgs.viewer import Exploration, FieldMeaning, SplatMeaning, pack
+from kfgs.viewer import Exploration, SplatMeaning, pack
 from kfgs.viewer.pack import pack_scene, rounded_far
 
 
@@ -38,22 +37,6 @@ def test_labels_and_distances_are_exact(room):
             state.set_distance(max(float(distance), 1e-9))
             carried = np.where(far.astype(np.float64) < state.distance, labels[source], -1)  # as JavaScript compares
             assert carried.tolist() == state.labels("color").tolist()
-
-
-@pytest.mark.parametrize("meaning", [lambda: FieldMeaning(field("fused"), few_classes()), lambda: grid().meaning])
-def test_scores_select_what_python_selects(meaning):
-    state = Exploration(meaning())
-    packed = pack_scene(state)
-    assert list(packed.header["query"]) == list(dict.fromkeys(state.meaning.names))
-    for words, entry in packed.header["query"].items():
-        scores = buffer(packed, entry["buffer"])
-        assert state.ask(words) is not None
-        assert entry["gamma"] == state.gamma
-        assert (entry["low"], entry["high"]) == state.gamma_range
-        middle = float(np.nanmedian(scores)) if np.isfinite(scores).any() else 0.5  # a score itself: it is not above
-        for gamma in (state.gamma, min(max(middle, entry["low"]), entry["high"])):
-            state.set_gamma(gamma)
-            assert (scores > np.float32(gamma)).tolist() == state.selected("semantic").tolist()
 
 
 def test_no_source_and_no_harmonics():

@@ -25,17 +25,6 @@ def session(tmp_path):
     return Session(cases_explorer.room(), tmp_path / "out")
 
 
-def test_an_answer_is_that_of_the_state(session):
-    answer, attached = session.call("ask", {"words": " chair "})
-    asked = session.state.meaning.ask("chair")
-    scores = torch.from_numpy(np.frombuffer(attached, "<f4").copy())
-    assert answer["words"] == "chair"
-    assert (answer["gamma"], answer["low"], answer["high"]) == (asked.selection.threshold, asked.low, asked.high)
-    assert scores.isnan().equal(~asked.valid)
-    assert scores[asked.valid].equal(asked.selection.scores[asked.valid].float())
-    assert (scores > answer["gamma"]).equal(asked.selection.mask)
-
-
 def test_connected_parts_of_a_selection(session):
     mask = torch.arange(60) % 2 == 0
     answer, attached = session.call("parts", {"side": "color"}, bits_of(mask))

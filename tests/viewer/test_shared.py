@@ -109,7 +109,8 @@ def test_a_person_is_heard_and_observers_are_told_once(viewer):
     assert [name for name, _ in seen] == ["hidden", "selection"]
     assert seen[1][1].mask.tolist() == mask.tolist()
     assert viewer.distance == 0.4  # and not what JavaScript rounds it to
-    heard(viewer, words="chair", gamma=0.25, sides=cases_page_sides(viewer))
+    no_hand = {side: own | {"selected": None} for side, own in viewer.wire["sides"].items()}
+    heard(viewer, words="chair", gamma=0.25, sides=no_hand)
     assert (viewer.question, viewer.gamma, viewer.state.asked.words) == ("chair", 0.25, "chair")
     assert viewer.selection.mask.tolist() == viewer.state.selected("color").tolist()
     seen.clear()
@@ -183,10 +184,6 @@ def test_the_tape_has_two_ends_in_the_world():
     refused(lambda: setattr(viewer, "tape", [[0, 0, 0]]), "tape:", "[2, 3]", "(1, 3)")
     viewer.tape = None
     assert (viewer.tape, viewer.wire["tape"]) == (None, [])
-
-
-def cases_page_sides(viewer):
-    return {side: own | {"selected": None} for side, own in viewer.wire["sides"].items()}
 
 
 def test_an_observer_may_set_another_value(viewer):

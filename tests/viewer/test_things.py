@@ -14,7 +14,7 @@ from cases_web import needs_chromium
 from messages import refused
 
 from kfgs.cameras import Camera
-from kfgs.labels import OrientedBox, connected_parts
+from kfgs.labels import OrientedBox
 from kfgs.splat.sh import rgb_to_sh0
 from kfgs.viewer import Exploration, SplatMeaning, Viewer
 from kfgs.viewer.pack import pack_scene
@@ -70,9 +70,6 @@ def test_boxes_and_labels_are_marks_in_the_frame_of_the_scene():
     things = viewer.state.things
     assert things["here"]["marks"] == [[[0, 1, 2]]]
     np.testing.assert_allclose(things["boxes"]["marks"], 2 * [(box.corners - torch.tensor([1000.0, 0, 0])).tolist()])
-    parts = connected_parts(cases_page.exploration().cloud("semantic").replace(names=("a", "b", "c")), "a")
-    viewer.add("parts", parts)
-    assert len(things["parts"]["marks"]) == len(parts) > 0
 
 
 @pytest.mark.parametrize(

@@ -23,17 +23,6 @@ def still_of(state):
     return np.asarray(Image.open(io.BytesIO(file))).astype(int)
 
 
-def test_the_scene_is_sent_once(tmp_path):
-    state = cases_explorer.room()
-    state.ask("chair")
-    widget = Viewer(state, title="room", out=tmp_path).widget
-    packed = pack.pack_scene(state, title="room")
-    assert widget.header == packed.header
-    assert widget.header["start"]["words"] == "chair"
-    assert widget.data == packed.compressed()
-    assert (widget.wire["words"], widget.header["phrases"]) == ("chair", False)
-
-
 def test_explore_in_a_notebook_gives_a_viewer(monkeypatch):
     state = cases_explorer.room()
     viewer = explore(
@@ -44,6 +33,10 @@ def test_explore_in_a_notebook_gives_a_viewer(monkeypatch):
     assert viewer.widget.wire["words"] == "chair"
     viewer.ask(None)
     assert viewer.widget.wire["words"] is None
+    packed = pack.pack_scene(viewer.state)
+    assert (viewer.widget.header, viewer.widget.data) == (packed.header, packed.compressed())
+    viewer.add("here", (0, 0, 0))  # once: not with the scene, too
+    assert (list(viewer.widget.things), viewer.widget.header["things"]) == (["here"], {})
     bundle = viewer._repr_mimebundle_()
     assert "application/vnd.jupyter.widget-view+json" in (bundle[0] if isinstance(bundle, tuple) else bundle)
     viewer.close()
