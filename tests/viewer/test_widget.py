@@ -30,10 +30,10 @@ def test_explore_in_a_notebook_gives_a_viewer(monkeypatch):
     )
     assert isinstance(viewer, Viewer)
     viewer.ask("chair")
+    packed = pack.pack_scene(viewer.state)
     assert viewer.widget.wire["words"] == "chair"
     viewer.ask(None)
     assert viewer.widget.wire["words"] is None
-    packed = pack.pack_scene(viewer.state)
     assert (viewer.widget.header, viewer.widget.data) == (packed.header, packed.compressed())
     viewer.add("here", (0, 0, 0))  # once: not with the scene, too
     assert (list(viewer.widget.things), viewer.widget.header["things"]) == (["here"], {})
