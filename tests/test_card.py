@@ -23,9 +23,6 @@ def test_no_value_and_no_line_is_long_and_none_is_left_out():
     assert short_value({str(i): i for i in range(9)}) == "9 entries"
     assert len(short_repr(namedtuple("Many", "a b c d e f g h")(*["word " * 50] * 8))) <= LINE
     assert "missing" not in html_card("x", {"missing": None})
-
-
-def test_paths_and_rows_say_what_they_are():
     assert short_value([Path("/a/room.ply"), Path("/a/b.json")]) == "[room.ply, b.json]"
     assert short_value([{"step": 1, "loss": 2.0}] * 3) == "3 of dict"
     assert short_value(["word " * 40] * 2).endswith(" word...")

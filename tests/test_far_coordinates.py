@@ -142,7 +142,7 @@ def test_pictures_of_two_clouds_share_an_origin(tmp_path):
     np.testing.assert_allclose(one, two, rtol=0, atol=1e-4)
     assert max(np.abs(np.asarray(mesh.points)).max() for mesh in frames) < 20
     look_through(plotter, camera)
-    seen = camera_of(plotter)
+    seen = camera_of(plotter, plotter.renderer)
     np.testing.assert_allclose(to_world(seen.center, seen.origin), UTM + np.array([0, -4, 1]), rtol=0, atol=1e-4)
     plotter.close()
 

@@ -122,8 +122,10 @@ def test_10_a_film(field, splat, tmp_path):
     cameras = orbit_cameras(splat.means, Orbit(frames=2, size=(48, 64)))
     for name, shown in {"splat": splat, "field": field, "both": {"a": field, "b": splat}}.items():
         assert viz.save_animation(tmp_path / f"{name}.gif", shown, cameras, legend=field).is_file()
-    call = lambda: viz.save_animation(tmp_path / "a.gif", "run", cameras)  # noqa: E731
-    refused(call, "expected a SemanticField or Gaussians", "SemanticField.load", error=TypeError)
+    assert viz.save_animation(tmp_path / "around.gif", splat).is_file()
+    for given in (cameras, None):
+        call = lambda given=given: viz.save_animation(tmp_path / "a.gif", "run", given)  # noqa: E731
+        refused(call, "expected a SemanticField or Gaussians", "SemanticField.load", error=TypeError)
 
 
 def test_11_my_own_network_is_a_teacher(scene, tmp_path):

@@ -62,9 +62,8 @@ def add_boxes(
     corners = torch.stack([box.corners.double().cpu() for box in solid])  # [B, 8, 3] in the world
     places = corners.numpy() - origin_of(plotter, choose_origin(corners.flatten(0, 1)))
     mesh = pv.line_segments_from_points(places[:, np.array(EDGES)].reshape(-1, 3).astype(np.float32))
-    mesh.cell_data["box"] = np.repeat(np.arange(len(boxes)), len(EDGES))
-    mesh.cell_data["label"] = classes[mesh.cell_data["box"]]
-    mesh.cell_data["rgb"] = colors[mesh.cell_data["box"]]
+    which = np.repeat(np.arange(len(boxes)), len(EDGES))
+    mesh.cell_data.update({"box": which, "label": classes[which], "rgb": colors[which]})
     if titles:
         axis = np.asarray(up, dtype=np.float64) / np.linalg.norm(up)
         centers, heights = places.mean(axis=1), places @ axis

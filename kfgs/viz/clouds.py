@@ -6,6 +6,7 @@ arrays on the actor's mesh (`actor.mapper.dataset["label"]`). pyvista is importe
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
@@ -17,10 +18,11 @@ from .._origin import to_world
 from ..cameras.camera import NEAR
 from ..gaussians import Gaussians
 from ..labels.transfer import as_cloud
+from ..splat.views import sum_pixels
 from .colors import COLORMAP, Array, CloudColors, ColorBy, FeatureColors, cloud_colors
 from .gaussian_actor import as_gaussians
 from .legends import letters
-from .plotter import draw_mesh, origin_of
+from .plotter import camera_of, draw_mesh, origin_of
 
 if TYPE_CHECKING:
     import pyvista as pv
@@ -31,6 +33,7 @@ Style = Literal["points", "gaussians", "ellipsoids"]
 FAINT = 0.5  # Gaussians up to this opacity get no ellipsoid: its surface would hide what is behind
 FACES = ((5_000, 2), (20_000, 1))  # up to 5,000 ellipsoids have 320 faces each, up to 20,000 have 80; more have 20
 MOST = 100_000  # ellipsoids, with 2 million faces: 1.2 s a frame in software
+BACKGROUND = 0.05  # a pixel that is covered less shows the background
 OUTER, MARGIN = 0.01, 0.05  # share of the points beyond each side of the box that a first view shows; room around it
 
 
@@ -45,6 +48,7 @@ def add_cloud(
     cmap: str = COLORMAP,
     show_scalar_bar: bool = False,
     near: float = NEAR,
+    on_pick: Callable[[int], object] | None = None,
     **options: Any,
 ) -> pv.Actor:
     """Draw a cloud as points, as anisotropic Gaussians, or as ellipsoids.
@@ -69,6 +73,8 @@ def add_cloud(
         cmap: the colour map of scores, as matplotlib names it.
         show_scalar_bar: whether to show the scale of scores.
         near: Gaussians up to this depth, in world units, are not drawn, as with `Camera.near`; they would be a haze.
+        on_pick: called when the key P is pressed with the mouse over a pixel: with the index of the Gaussian that shows most
+            there as kfgs renders the cloud, -1 for the background.
         options: of `plotter.add_mesh`: `name` (replaces what has this name), `opacity`, `point_size`, `pickable`, ...
 
     Raises:
@@ -105,6 +111,8 @@ def add_cloud(
         _add_shapes(mesh, gaussians)
         followed = gaussians.detach() if by_view else None
         actor = as_gaussians(plotter, mesh, near, gaussians.antialiased, followed, **drawn | options)
+    if on_pick is not None:
+        _call_when_picked(plotter, gaussians, near, on_pick)
     if show_scalar_bar and colors.clim is not None:
         actor.mapper.lookup_table.apply_cmap(cmap)  # the colours are given: its own table is for the bar alone
         actor.mapper.scalar_range = colors.clim
@@ -141,6 +149,20 @@ def recolor_cloud(
     if opacities is not None:
         mesh.point_data["opacity"] = opacities.astype(np.float32)[index]
     mesh.point_data["rgb"] = colors[index]
+
+
+def _call_when_picked(plotter: pv.Plotter, gaussians: Gaussians, near: float, call: Callable[[int], object]) -> None:
+    """Call with the Gaussian of the largest rendering weight at each pixel that is picked."""
+
+    def pick(_: Any, picker: Any) -> None:
+        renderer, (x, y, _) = picker.GetRenderer(), picker.GetSelectionPoint()
+        camera, (left, low) = camera_of(plotter, renderer, near), renderer.GetOrigin()
+        signal = torch.zeros(*camera.size, 1).to(gaussians.means)
+        signal[camera.height - 1 - int(y - low), int(x - left)] = 1  # VTK counts rows from below
+        index, weights, _ = sum_pixels(gaussians, camera, signal)
+        call(int(index[weights.argmax()]) if float(weights.sum()) > BACKGROUND else -1)
+
+    plotter.enable_point_picking(pick, use_picker=True, pickable_window=True, show_message=False, show_point=False)
 
 
 def _frame_middle(renderer: Any) -> None:
@@ -185,7 +207,6 @@ def _ellipsoids(gaussians: Gaussians) -> pv.PolyData:
     gaussians = gaussians.select(opaque).detach()
     ball = pv.Icosphere(nsub=next((times for most, times in FACES if count <= most), 0))
     corners, faces = np.array(ball.points, dtype=np.float32), np.array(ball.regular_faces)
-    corners /= np.linalg.norm(corners, axis=1, keepdims=True)
     turn = as_array(quaternion_to_rotation_matrix(gaussians.quats.double())).astype(np.float32)  # [N, 3, 3]
     half = as_array(gaussians.scales).astype(np.float32)[:, None, :]
     means = as_array(gaussians.means).astype(np.float32)[:, None]

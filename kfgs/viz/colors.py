@@ -22,6 +22,7 @@ SOURCES = {
     "label": "labels", "class": "labels", "score": "scores", "rgb": "sh", "view": "sh", "feature": "features",
     "opacity": "opacities",
 }  # fmt: skip
+USUAL = ("label", "rgb", "feature", "opacity")  # the first of these that there is
 ColorBy = str | Selection | Rule | Tensor | Array | None
 COLORMAP = "cividis"  # brightness rises evenly; looks the same to colour-blind eyes
 
@@ -102,8 +103,7 @@ def cloud_colors(
 ) -> CloudColors:
     """Colour a cloud; arguments and errors are those of `add_cloud`."""
     if color_by is None:
-        parts = {"label": gaussians.labels, "rgb": gaussians.sh, "feature": gaussians.features}
-        color_by = next((name for name, values in parts.items() if values is not None), "opacity")
+        color_by = next(name for name in USUAL if getattr(gaussians, SOURCES[name]) is not None)
     color_by = as_selection(color_by, gaussians).scores if isinstance(color_by, Selection | Rule) else color_by
     if isinstance(color_by, str):
         names = class_names(gaussians)

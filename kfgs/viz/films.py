@@ -18,7 +18,7 @@ from torch import Tensor
 
 from .._check import as_array, check_range, check_shapes
 from .._files import atomic_path
-from ..cameras import Camera
+from ..cameras import Camera, orbit_cameras
 from ..gaussians import Gaussians
 from ..labels import Part
 from ..labels.color import parse_color
@@ -27,6 +27,7 @@ from ..labels.transfer import as_cloud
 from ..scenes import Scene
 from ..splat import rasterize
 from .colors import Array, ColorBy, FeatureColors, cloud_colors
+from .linked import upwards
 from .pictures import as_bytes, check_suffix, draw_legend, picture_grid, picture_sheet, resize_photo, save_picture
 
 if TYPE_CHECKING:
@@ -123,7 +124,7 @@ def show_photos(scene: Scene) -> Show:
 def save_animation(
     path: str | Path,
     shows: Any,
-    cameras: Sequence[Camera],
+    cameras: Sequence[Camera] | None = None,
     *,
     fps: float = 15.0,
     legend: Gaussians | SemanticField | None = None,
@@ -135,12 +136,16 @@ def save_animation(
         path: a name that ends in .gif or .mp4. The file appears whole or not at all.
         shows: a cloud, a field, a function camera -> picture (`show_cloud`), or several of these by title, side by side.
         cameras: one per frame (`kfgs.cameras.orbit_cameras`, `path_cameras`); all frames have the size of the first, in which
-            those of other shapes are seen whole.
+            those of other shapes are seen whole. None: once around the first cloud.
         fps: frames per second; at most 50 in a GIF, because browsers slow down films with shorter frames.
         legend: the labelled cloud, or the field, whose classes are listed below every frame; None: no legend.
         progress: called after each frame with (done, all).
     """
     named = shows if isinstance(shows, Mapping) else {"": shows}
+    first: Any = next(iter(named.values()), print)
+    if cameras is None and not callable(first):
+        cloud = as_cloud(first, "shows")
+        cameras = orbit_cameras(cloud.means, up=upwards(getattr(first, "cameras", ())), origin=cloud.origin)
     if not named or not cameras:
         raise ValueError(
             "shows, cameras: expected at least one of each, got none; kfgs.cameras.orbit_cameras makes some"

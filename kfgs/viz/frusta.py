@@ -57,8 +57,7 @@ def add_cameras(
         raise ValueError("cameras: expected at least one camera, got none; load a scene with views")
     if not callable(images) and len(images) not in (0, len(cameras)):
         raise ValueError(f"images: expected {len(cameras)} (one per camera), got {len(images)}; give one for each")
-    places = [camera.with_origin(cameras[0].origin).center for camera in cameras]
-    centers = np.stack([as_array(place) for place in places]).astype(np.float64)
+    centers = np.stack([as_array(camera.with_origin(cameras[0].origin).center) for camera in cameras])
     depth = size if size is not None else 0.05 * float(np.ptp(centers, axis=0).max()) or 0.2
     check_range("size", depth, 0, closed=(False, False))
     chosen = evenly(len(cameras), most)
@@ -79,10 +78,8 @@ def add_cameras(
 
 def _frustum(camera: Camera, depth: float) -> Array:  # [10, 2, 3]
     """Four edges from the centre, four around the picture, two for the roof."""
-    K, E = as_array(camera.K).astype(np.float64), as_array(camera.viewmat).astype(np.float64)
-    w, h = camera.width, camera.height
-    pixels = np.array([[0, 0], [w, 0], [w, h], [0, h], [w / 2, -h / 5]])  # the corners, then the ridge of the roof
+    K, R, o = (as_array(part).astype(np.float64) for part in (camera.K, camera.R, camera.center))
+    pixels = np.array([[0, 0], [1, 0], [1, 1], [0, 1], [0.5, -0.2]]) * camera.size[::-1]  # corners, the ridge
     rays = np.column_stack([(pixels - K[:2, 2]) / K[[0, 1], [0, 1]], np.ones(len(pixels))]) * depth
-    a, b, c, d, ridge = (rays - E[:3, 3]) @ E[:3, :3]  # R^T (x - t)
-    o = -E[:3, 3] @ E[:3, :3]
+    a, b, c, d, ridge = rays @ R + o
     return np.array([(o, a), (o, b), (o, c), (o, d), (a, b), (b, c), (c, d), (d, a), (a, ridge), (ridge, b)])

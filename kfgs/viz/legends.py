@@ -10,7 +10,7 @@ from .._check import as_array
 from ..gaussians import Gaussians
 from ..labels.selection import class_names
 from ..labels.transfer import as_cloud
-from .pictures import LEGEND_INK, draw_legend
+from .pictures import LEGEND_INK, LEGEND_PAPER, draw_legend
 
 if TYPE_CHECKING:
     import pyvista as pv
@@ -66,8 +66,6 @@ def add_title(plotter: pv.Plotter, title: str) -> pv.CornerAnnotation:
     return plotter.add_text(title, position="upper_edge", font_size=10, color=letters(plotter))
 
 
-def letters(plotter: pv.Plotter) -> tuple[float, float, float]:
+def letters(plotter: pv.Plotter) -> tuple[int, int, int]:
     """A text colour that can be read on the active subplot's background."""
-    dark = np.mean(plotter.renderer.GetBackground()) < DARK
-    ink = (255, 255, 255) if dark else LEGEND_INK
-    return (ink[0] / 255, ink[1] / 255, ink[2] / 255)
+    return LEGEND_PAPER if np.mean(plotter.renderer.GetBackground()) < DARK else LEGEND_INK

@@ -82,8 +82,7 @@ def draw_legend(
         text = "no class" if label < 0 else names[label]
         length = size + gap + round(font.getlength(text)) + 2 * gap
         if places and width is None and height is not None and y + line + gap // 2 > height:
-            left, y = right, gap
-            x = left
+            left, x, y = right, right, gap
         if x > left and (width is None or x + length > width):
             x, y = left, y + line
         places.append((x, y, tuple(swatch), text))

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Row = Mapping[str, Any]  # of a recorded history: numbers by name
+NUMBER = int | float
 # Okabe and Ito's darker colours, which are readable as lines
 LINES = np.array([[0, 114, 178], [213, 94, 0], [0, 158, 115], [204, 121, 167], [86, 180, 233], [230, 159, 0]]) / 255
 INK, REST = (0.08, 0.08, 0.08), (0.75, 0.75, 0.75)
@@ -49,7 +50,7 @@ def plot_history(history: Sequence[Row] | Mapping[str, Sequence[Row]], path: str
     named = history if isinstance(history, Mapping) else {"": history}
     rows = [row for part in named.values() for row in part]
     keys = [key for key in dict.fromkeys(key for row in rows for key in row) if key not in (*STEPS, "seconds")]
-    keys = [key for key in keys if any(_is_number(row.get(key)) and row[key] for row in rows)]
+    keys = [key for key in keys if any(isinstance(row.get(key), NUMBER) and row[key] for row in rows)]
     if not keys:
         raise ValueError(f"history: expected rows with numbers to draw, got {len(rows)} without; was anything trained?")
     keys.sort(key=lambda key: key not in ("loss", "size"))  # stable: the others keep their order
@@ -60,7 +61,7 @@ def plot_history(history: Sequence[Row] | Mapping[str, Sequence[Row]], path: str
         axes = figure.add_subplot(lines, columns, panel + 1)
         for i, (name, part) in enumerate(named.items()):
             step = next((word for word in STEPS if part and word in part[0]), "row")
-            points = [(row.get(step, at), row[key]) for at, row in enumerate(part) if _is_number(row.get(key))]
+            points = [(row.get(step, at), row[key]) for at, row in enumerate(part) if isinstance(row.get(key), NUMBER)]
             x, y = zip(*points, strict=True) if points else ((), ())
             color = LINES[(panel if len(named) == 1 else i) % len(LINES)]
             # not clipped: zeros show over the frame
@@ -68,7 +69,7 @@ def plot_history(history: Sequence[Row] | Mapping[str, Sequence[Row]], path: str
             axes.set(xlabel=step, title=key)
         axes.grid(alpha=0.3)
         if key in COUNTS:
-            axes.set_ylim(0, 1.06 * max(1, *(row[key] for row in rows if _is_number(row.get(key)))))
+            axes.set_ylim(0, 1.06 * max(1, *(row[key] for row in rows if isinstance(row.get(key), NUMBER))))
     if len(named) > 1:
         _legend_below(axes)
     return finish(figure, path)
@@ -162,12 +163,9 @@ def plot_scores(selection: Selection, path: str | Path | None = None) -> Figure:
 
 def new_figure(width: float, height: float) -> Figure:
     """An empty figure without matplotlib's global state; sizes in inches."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(width, height), dpi=110, layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure
+    return Figure(figsize=(width, height), dpi=110, layout="constrained")
 
 
 def finish(figure: Figure, path: str | Path | None) -> Figure:
@@ -189,7 +187,3 @@ def _shares(name: str, values: Tensor | Array) -> Array:
     if (wrong := shares[(shares < 0) | (shares > 1)]).size:
         raise ValueError(f"{name}: expected fractions in [0, 1] or NaN, got {wrong[0]:g}; divide per cents by 100")
     return shares
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)

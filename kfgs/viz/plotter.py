@@ -40,8 +40,7 @@ _origins: WeakKeyDictionary[pv.Plotter, Origin] = WeakKeyDictionary()
 
 def has_display() -> bool:
     """Whether windows can be opened (Windows and macOS: always)."""
-    found = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
-    return bool(found) or not sys.platform.startswith("linux")
+    return not sys.platform.startswith("linux") or any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
 
 
 def prepare() -> None:
@@ -101,8 +100,7 @@ def make_plotter(
     # plotters lie in reference cycles. If a closed one is freed between two renders of another, Mesa can crash
     gc.collect()
     hidden = not has_display() if off_screen is None else off_screen
-    options: dict[str, Any] = {"shape": shape} if shape != (1, 1) else {}
-    plotter = pv.Plotter(off_screen=hidden, window_size=(width, height), **options)
+    plotter = pv.Plotter(off_screen=hidden, window_size=(width, height), shape=shape)
     plotter.set_background(background or pv.global_theme.background)
     return plotter
 
@@ -131,17 +129,14 @@ def look_through(plotter: pv.Plotter, camera: Camera) -> None:
         ValueError: if the camera's lens distorts.
     """
     refuse_distortion(camera)
-    camera = camera.with_origin(origin_of(plotter, camera.origin))
-    K, E = camera.K.detach().double().cpu(), camera.viewmat.detach().double().cpu()
-    fx, fy, cx, cy = float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
-    R, center = E[:3, :3], -E[:3, :3].T @ E[:3, 3]
-    view = plotter.camera
+    camera = camera.with_origin(origin_of(plotter, camera.origin)).to("cpu", torch.float64)
+    R, center, view = camera.R.detach(), camera.center.detach(), plotter.camera
     view.position = tuple(center.tolist())
     view.focal_point = tuple((center + R[2]).tolist())  # z of the camera points forward ...
     view.up = tuple((-R[1]).tolist())  # ... and y down
-    view.view_angle = degrees(2 * atan(camera.height / 2 / fy))
-    view.SetWindowCenter(1 - 2 * cx / camera.width, 2 * cy / camera.height - 1)
-    view.SetExplicitAspectRatio((camera.width / fx) / (camera.height / fy))
+    view.view_angle = degrees(2 * atan(camera.height / 2 / camera.fy))
+    view.SetWindowCenter(1 - 2 * camera.cx / camera.width, 2 * camera.cy / camera.height - 1)
+    view.SetExplicitAspectRatio((camera.width / camera.fx) / (camera.height / camera.fy))
     view.SetUseExplicitAspectRatio(True)
     plotter.camera_set = True  # otherwise the first render moves the camera to see everything
     plotter.renderer.ResetCameraClippingRange()
@@ -167,17 +162,15 @@ def draw_view(
         plotter.close()
 
 
-def camera_of(plotter: pv.Plotter, subplot: tuple[int, int] = (0, 0), *, near: float = NEAR) -> Camera:
+def camera_of(plotter: pv.Plotter, renderer: Any, near: float = NEAR) -> Camera:
     """The posed camera (float64) of a subplot's current view, with the subplot's size: the inverse of `look_through`."""
-    renderer = plotter.renderers[plotter.renderers.loc_to_index(subplot)]
     view, (width, height) = renderer.GetActiveCamera(), renderer.GetSize()
     seen, drawn = view.GetViewTransformMatrix(), view.GetProjectionTransformMatrix(width / height, -1.0, 1.0)
     E, P = (np.array([[matrix.GetElement(i, j) for j in range(4)] for i in range(4)]) for matrix in (seen, drawn))
     E[1:3] *= -1  # VTK's y points up and z backward
     K = np.array([[P[0, 0], 0, 1 - P[0, 2]], [0, P[1, 1], 1 + P[1, 2]], [0, 0, 1]])
     K[:2] *= np.array([[width / 2], [height / 2]])
-    lens = torch.from_numpy(K), width, height
-    return Camera(torch.from_numpy(E), *lens, near=near, origin=origin_of(plotter, ORIGIN))
+    return Camera(torch.from_numpy(E), torch.from_numpy(K), width, height, near=near, origin=origin_of(plotter, ORIGIN))
 
 
 prepare()  # before the user makes a plotter

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
-from .._check import as_array, check_range
+from .._check import as_array
 from ..cameras import Camera
 from ..gaussians import Gaussians
 from ..labels.selection import class_names
-from ..labels.transfer import Sources, as_cloud, positions
+from ..labels.transfer import Sources, as_cloud, nearest_labels, positions
 from .clouds import add_cloud, recolor_cloud
 from .colors import Array, cloud_colors
 from .legends import add_legend, letters
@@ -81,7 +81,6 @@ def show_transfer(
         picture.draw(picture.distance)
         span, bar = (0.0, REACH * picture.distance), {"pointa": (0.62, 0.08), "pointb": (0.97, 0.08), "fmt": "%.3g"}
         plotter.add_slider_widget(picture.draw, span, value=picture.distance, color=letters(plotter), **bar)
-        plotter.enable_point_picking(picture.name_picked, use_picker=True, tolerance=0.005, show_message=False)
         look_over(plotter, up.tolist())
     except BaseException:
         plotter.close()
@@ -100,15 +99,11 @@ class _Picture:
         self.semantic_rows, self.color_rows = rows  # which Gaussians of each cloud are drawn
         self.classes = classes = as_array(semantic.labels)
         self.sources, targets = positions("field.means", semantic.means), as_array(splat.means).astype(np.float64)
-        known = np.isfinite(targets).all(axis=1)
-        self.color_rows = self.color_rows[known[self.color_rows]]
-        tree = Sources(self.sources, classes >= 0)
-        self.distance = tree.default_distance(targets[known])[0] if distance is None else distance
-        check_range("distance", self.distance, 0, closed=(False, False))
-        self.distances, self.givers = np.full(len(known), np.inf), np.full(len(known), -1)
-        reach = REACH * self.distance  # the slider's end
-        self.distances[known], self.givers[known] = tree.nearest(targets[known], reach)
-        self.labels = np.append(classes, -1)[self.givers]
+        self.color_rows = self.color_rows[np.isfinite(targets[self.color_rows]).all(axis=1)]
+        self.distance = nearest_labels(self.sources, classes, targets, distance).distance
+        carried = nearest_labels(self.sources, classes, targets, REACH * self.distance)  # up to the slider's end
+        self.labels, self.distances = as_array(carried.labels), as_array(carried.distances)
+        self.givers, tree = as_array(carried.sources), Sources(self.sources, classes >= 0)
         nearest = range(1, min(NEIGHBOURS, len(tree.index)) + 1)
         far, neighbours = tree.tree.query(np.nan_to_num(targets), [*nearest], workers=-1)
         others = classes[tree.index[neighbours]] != self.labels[:, None]
@@ -122,7 +117,7 @@ class _Picture:
         # joined, because VTK does not mix two clouds, without what only one of them has
         parts = [semantic.select(self.semantic_rows), above.select(self.color_rows)]
         shapes = [Gaussians(part.means, part.quats, part.scales, part.opacities, origin=part.origin) for part in parts]
-        self.cloud = add_cloud(plotter, Gaussians.cat(shapes), color_by="opacity", style="gaussians")
+        self.cloud = add_cloud(plotter, Gaussians.cat(shapes), color_by="opacity", style="gaussians", on_pick=self.tell)
         add_legend(plotter, semantic.select(self.semantic_rows))
 
     def draw(self, distance: float) -> None:
@@ -146,12 +141,11 @@ class _Picture:
         counts = f"{(~near).sum():,} without a label (red), {unsure.sum():,} disputed (yellow)"
         self._write("counts", f"lambda {distance:.3g}: {len(near):,} Gaussians, {counts}")
 
-    def name_picked(self, _: Any, picker: Any) -> None:
+    def tell(self, row: int) -> None:
         """Write which Gaussian was picked, its class, and who gave it."""
-        if picker.GetPointId() < 0:
-            return
-        row = int(self.cloud.mapper.dataset["index"][picker.GetPointId()])
-        if row < len(self.semantic_rows):
+        if row < 0:
+            self._write("picked", "")
+        elif row < len(self.semantic_rows):
             i = self.semantic_rows[row]
             self._write("picked", f"semantic Gaussian {i}: {self.names[self.classes[i]]}")
         else:

@@ -8,10 +8,11 @@ import pyvista as pv
 import torch
 from cases_viz import data, some_camera, some_gaussians, some_plotter
 from messages import refused, tells
+from oracles_picking import gaussian_at
 
 from kfgs.cameras.camera import Distortion
 from kfgs.splat.covariance import covariance_3d
-from kfgs.viz import FeatureColors, add_cloud, look_through, palette, show_cloud, to_pyvista
+from kfgs.viz import FeatureColors, add_cloud, look_through, make_plotter, palette, show_cloud, to_pyvista
 from kfgs.viz.clouds import recolor_cloud
 from kfgs.viz.colors import cloud_colors
 
@@ -165,6 +166,22 @@ def test_a_page_that_pyvista_exports_has_the_cloud(style, tmp_path):
         add_cloud(plotter, some_gaussians(500), style=style)
     plotter.close()
     assert sizes[1] > sizes[0] + 500 * 12  # at least the positions
+
+
+def test_a_pick_is_the_gaussian_that_shows_most_there():
+    cloud, camera, picked, expected = some_gaussians(), some_camera(), [], []
+    with some_plotter():
+        plotter = make_plotter(camera.height, 2 * camera.width, shape=(1, 2), off_screen=True)
+    plotter.subplot(0, 1)
+    add_cloud(plotter, cloud, style="gaussians", on_pick=picked.append)
+    look_through(plotter, camera)
+    plotter.screenshot()
+    for x, y in np.ndindex(16, 12):
+        plotter.iren.picker.Pick(camera.width + 10 * x, 10 * y, 0, plotter.renderer)  # y from below
+        expected.append(gaussian_at(cloud, camera, 10 * x + 0.5, camera.height - 10 * y - 0.5))
+    assert picked == [-1 if index is None else index for index in expected]
+    assert len(set(picked)) > 8
+    plotter.close()
 
 
 def test_a_faint_cloud_of_gaussians_is_faint(plotter):

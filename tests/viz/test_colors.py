@@ -12,16 +12,12 @@ def cloud_of_features(seed=0, n=500, d=9):
     return (torch.randn(n, d, generator=generator) * scales) @ turn.T + 7, turn
 
 
-def test_axes_are_the_principal_ones():
+def test_axes_are_the_principal_ones_and_the_same_in_every_view():
     features, turn = cloud_of_features()
     axes = FeatureColors.fit(features).axes
     assert torch.allclose((axes.float().T @ turn[:, :3]).abs(), torch.eye(3), atol=0.15)
     torch.testing.assert_close(axes.T @ axes, torch.eye(3, dtype=torch.float64))
-
-
-def test_equal_features_have_equal_colours_in_every_view():
-    features, _ = cloud_of_features()
-    colors = FeatureColors.fit(features)
+    colors = FeatureColors.fit(features)  # equal features have equal colours in every view
     whole, part = colors(features.reshape(20, 25, 9)), colors(features[:40])
     assert (whole.shape, whole.dtype) == ((20, 25, 3), np.uint8)
     np.testing.assert_array_equal(whole.reshape(-1, 3)[:40], part)

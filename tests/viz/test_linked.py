@@ -101,8 +101,8 @@ def test_lines_join_lifted_destinations_to_their_sources_for_the_sliders_lambda(
 def test_a_pick_names_the_gaussian_and_who_gave_its_label():
     plotter, told = opened(SRC, DST), set()
     plotter.screenshot()
-    for x, y in np.ndindex(50, 50):
-        plotter.iren.picker.Pick(4 * x, 4 * y, 0, plotter.renderer)
+    for x, y in np.ndindex(14, 14):
+        plotter.iren.picker.Pick(14 * x, 14 * y, 0, plotter.renderer)
         told.add(text_of(plotter).split("\n")[-1])
     lines = lines_of(plotter)
     links = zip(*(lines[name] for name in ("destination", "label", "source", "distance")), strict=True)
