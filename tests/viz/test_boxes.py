@@ -1,5 +1,4 @@
 import numpy as np
-import pytest
 import torch
 from cases_viz import data, some_plotter
 from messages import refused
@@ -12,12 +11,6 @@ def between(low, high):
     """A box along the world's axes."""
     low, high = torch.tensor(low).double(), torch.tensor(high).double()
     return OrientedBox((low + high) / 2, torch.eye(3).double(), (high - low) / 2)
-
-
-@pytest.fixture
-def plotter():
-    with some_plotter() as plotter:
-        yield plotter
 
 
 def test_edges_are_those_of_the_box(plotter):

@@ -1,18 +1,11 @@
 import numpy as np
-import pytest
 import torch
-from cases_viz import data, some_camera, some_plotter
+from cases_viz import data, some_camera
 from messages import refused
 
 from kfgs.cameras import Camera
 from kfgs.viz import add_cameras, look_through
 from kfgs.viz.linked import evenly
-
-
-@pytest.fixture
-def plotter():
-    with some_plotter() as plotter:
-        yield plotter
 
 
 def turned(camera, times):

@@ -1,18 +1,11 @@
 import numpy as np
-import pytest
-from cases_viz import some_gaussians, some_plotter
+from cases_viz import some_gaussians
 from messages import refused
 
 from kfgs.viz import add_legend, palette
 from kfgs.viz.pictures import draw_legend
 
 NAMES = [f"class {i}" for i in range(18)]
-
-
-@pytest.fixture
-def plotter():
-    with some_plotter() as plotter:
-        yield plotter
 
 
 def colors_in(picture, labels):
