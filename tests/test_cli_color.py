@@ -193,12 +193,10 @@ def test_convert_by_class_tells_the_losses_of_every_class(tmp_path, capsys):
     )  # fmt: skip
     write_splats(cloud.replace(origin=(5e5, 4e6, 0.0)), tmp_path / "far.ply")
     assert main(["convert", str(tmp_path / "far.ply"), str(tmp_path / "objects"), "--by-class"]) == 0
-    notes = [line for line in capsys.readouterr().out.splitlines() if "relative to the origin" in line]
-    assert [re.findall(r"coordinates of (\S+) are", note) for note in notes] == [
-        ["00_wall.ply"],
-        ["01_chair.ply"],
-        ["02_sofa.ply"],
-    ]
+    printed, files = capsys.readouterr().out, ["00_wall.ply", "01_chair.ply", "02_sofa.ply"]
+    assert re.findall(r"coordinates of (\S+) are relative to the origin", printed) == files
+    for name in files:
+        assert f"{tmp_path / 'objects' / name}.origin.json" in printed
 
 
 def test_all_photographs_can_be_used_and_none_is_left_to_score(room, splat, tmp_path, capsys):

@@ -224,7 +224,7 @@ def _pack(source: Path, target: Path, precision: Any) -> None:
 
 
 def _convert_by_class(source: Path, folder: Path) -> None:
-    """One plain PLY for each class of a splat. The class is in the name of its file, so there is nothing next to it."""
+    """One plain PLY for each class of a splat. The class is in the name of its file, and in none next to it."""
     check_output("target", folder, "a folder")
     splats = open_splats("source", source, labelled=True)
     if len(splats) == 0:
@@ -242,7 +242,7 @@ def _convert_by_class(source: Path, folder: Path) -> None:
         say(f"{name}: {len(part)} Gaussians")
     for words in dict.fromkeys(words for file in written for words in file.lost):
         say(f"note: {words}")
-    wrote([folder / name for name in parts])
+    wrote([folder / path.name for file in written for path in file.paths])
 
 
 def _bytes_of(path: Path) -> int:

@@ -283,6 +283,8 @@ def _image(name: str, camera_id: int, numbers: list[float]) -> ColmapImage:
     """An image with its pose from qw qx qy qz tx ty tz."""
     if not (name.isprintable() and is_inside(name)):
         raise ValueError(f"{name!r} is not a file inside the image folder: rename the image in the model")
+    if len(numbers) != 7:
+        raise ValueError(f"{len(numbers)} numbers of its pose, not 7: qw qx qy qz tx ty tz")
     w, x, y, z, tx, ty, tz = numbers
     norm = math.hypot(w, x, y, z)
     if not abs(norm - 1) < QUATERNION_SLACK or not all(abs(number) < MAX_NUMBER for number in numbers):

@@ -89,7 +89,7 @@ def extract_features(
         FileNotFoundError: if a picture is missing.
     """
     check_is_scene(scene)
-    folder, (encode, identity), chosen = as_path(folder), _as_encoder(teacher), scene.select(split)
+    folder, (encode, identity), chosen = as_path(folder), as_encoder(teacher), scene.select(split)
     pictures = {chosen.stem(i): path for i, path in enumerate(chosen.image_paths)}
     if not pictures:
         raise ValueError("split: expected at least one view, got none; name some")
@@ -137,7 +137,7 @@ def extract_features(
     return manifest
 
 
-def _as_encoder(teacher: Any) -> tuple[Callable[[Tensor], Tensor], dict[str, Any]]:
+def as_encoder(teacher: Any) -> tuple[Callable[[Tensor], Tensor], dict[str, Any]]:
     """The function from a picture to features, and what is known about the teacher as JSON."""
     encode, version = getattr(teacher, "encode_image", teacher), str(getattr(teacher, "version", None) or "")
     if inspect.isclass(teacher) or not callable(encode):

@@ -60,9 +60,8 @@ def list_images(folder: str | Path, suffixes: tuple[str, ...] = IMAGE_SUFFIXES) 
     names: list[str] = []
     for here, folders, files in os.walk(root):
         folders[:] = [name for name in folders if not (name.startswith(".") or (name == MASKS and here == str(root)))]
-        for name in files:
-            if not name.startswith(".") and name.lower().endswith(suffixes):
-                names.append((Path(here) / name).relative_to(root).as_posix())
+        shown = [name for name in files if not name.startswith(".") and name.lower().endswith(suffixes)]
+        names += [(Path(here) / name).relative_to(root).as_posix() for name in shown]
     return sorted(names, key=natural_key)
 
 

@@ -31,8 +31,7 @@ Frame = NDArray[np.uint8]  # [H, W, 3]
 
 def is_video(path: str | Path) -> bool:
     """Whether a path is a file with the ending of a video."""
-    path = as_path(path)
-    return path.suffix.lower() in VIDEO_SUFFIXES and path.is_file()
+    return as_path(path).suffix.lower() in VIDEO_SUFFIXES and as_path(path).is_file()
 
 
 def extract_frames(video: str | Path, out: str | Path, *, fps: float = 2.0, progress: bool = False) -> list[Path]:

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from .._check import as_tensor, check_shapes
+from ..scenes.extract import as_encoder
 
 _ROUNDING = 1e-4  # a resampled picture may exceed [0, 1] by this much
 
@@ -121,12 +122,8 @@ def as_teacher(source: Teacher | Callable[[Tensor], Tensor]) -> Teacher:
 
 
 def identify(teacher: Teacher) -> dict[str, Any]:
-    """JSON of what a teacher's features depend on: its `identity`, or its name and version."""
-    known = getattr(teacher, "identity", None)
-    if isinstance(known, dict):
-        return dict(known)
-    version = getattr(teacher, "version", "")
-    return {"name": teacher.name, **({"version": str(version)} if version else {})}
+    """JSON of what a teacher's features depend on, as their folder has it: its name, and its `identity` or version."""
+    return as_encoder(teacher)[1]
 
 
 def check_picture(image: Any) -> None:

@@ -167,7 +167,10 @@ BAD_TABLES = [
     ({"images": IMAGES.replace("1 2 3 1 b", "1 x 3 1 b")}, ["images.txt", "line 3 ", "'x'"]),
     ({"images": IMAGES.replace("2 0.6", "x 0.6")}, ["images.txt", "line 3 ", "'x'"]),
     ({"images": IMAGES.replace("3 1 b", "3 x b")}, ["images.txt", "line 3 ", "'x'"]),
-    ({"images": IMAGES.replace("1 2 3 1 b.png", "1 2 1 b.png")}, ["images.txt", "line 3 "]),
+    (
+        {"images": IMAGES.replace("1 2 3 1 b.png", "1 2 1 b.png")},
+        ["line 3 ", "6 numbers of its pose", "qw qx qy qz tx"],
+    ),
     ({"images": IMAGES.replace("b.png", "../b.png")}, ["line 3 ", "inside the image folder", "'../b.png'", "rename"]),
     ({"images": IMAGES.replace("b.png", "/etc/b.png")}, ["inside the image folder", "'/etc/b.png'", "rename"]),
     ({"images": IMAGES.replace("2 0.6", "1 0.6")}, ["line 3 ", "id 1 again"]),

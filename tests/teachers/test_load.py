@@ -55,7 +55,7 @@ def test_identity_holds_version_source_weights_and_options(write):
     assert function.encode_image(torch.zeros(3, 4, 8)).shape == (3, 2, 8)
     assert identify(function)["source"] == "mine:one"
     write(CLASS.replace("    name = 'scaled'\n", "    name, identity = 'scaled', {'version': 3}\n"))
-    assert identify(load_teacher("mine:Scaled")) == {"version": 3}  # what an object brings is its own
+    assert identify(load_teacher("mine:Scaled")) == {"name": "scaled", "version": 3}  # as the folder of its maps has it
 
 
 def test_modules_are_found_beside_the_command_but_the_path_stays(write):
