@@ -70,6 +70,10 @@ def test_4_boxes_of_chairs_as_json(field, tmp_path):
     asked = kfgs.connected_parts(field, field.query("chair"))
     ruled = kfgs.connected_parts(field, OfClass("chair"))
     assert parts[0].count == ruled[0].count
+    columns = {name: column for name, column in field.label().to_numpy().items() if column.ndim == 1}  # for pandas
+    assert {name: len(column) for name, column in columns.items()} == dict.fromkeys(
+        ("opacities", "labels", "scores"), len(field)
+    )
     assert abs(asked[0].count - parts[0].count) <= 5
 
 

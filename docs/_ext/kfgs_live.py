@@ -13,8 +13,8 @@ from sphinx.util.docutils import SphinxDirective
 
 from kfgs import SemanticField, read_splats
 from kfgs.viewer.meaning import FieldMeaning
-from kfgs.viewer.page import save_html
 from kfgs.viewer.state import Exploration
+from kfgs.viewer.viewer import Viewer
 
 PICTURES = Path(__file__).resolve().parents[1] / "pictures"
 PAGE = "_static/live.html"
@@ -39,7 +39,7 @@ def write_page(app: Sphinx, exception: Exception | None) -> None:
     if exception is None and app.builder.format == "html":
         field, splat = SemanticField.load(PICTURES / "live.kfgs"), read_splats(PICTURES / "live.spz")
         state = Exploration(FieldMeaning(field, cameras=field.cameras), splat, cameras=field.cameras)
-        save_html(state, Path(app.outdir, PAGE), title="kfgs: a room")
+        Viewer(state, title="kfgs: a room").save_html(Path(app.outdir, PAGE))
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
