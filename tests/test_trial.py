@@ -68,6 +68,7 @@ def test_4_boxes_of_chairs_as_json(field, tmp_path):
     (tmp_path / "boxes.json").write_text(json.dumps([part.to_json() for part in parts]))
     assert json.loads((tmp_path / "boxes.json").read_text())[0]["count"] == len(parts[0].gaussians)
     asked = kfgs.connected_parts(field, field.query("chair"))
+    assert kfgs.connected_parts(field, ["chair", OfClass("floor")])[0].count > parts[0].count
     ruled = kfgs.connected_parts(field, OfClass("chair"))
     assert parts[0].count == ruled[0].count
     columns = {name: column for name, column in field.label().to_numpy().items() if column.ndim == 1}  # for pandas
@@ -83,6 +84,7 @@ def test_5_classes_for_my_points_and_my_mesh(field):
     assert len(carried.labels) == mesh.n_points
     refused(lambda: kfgs.transfer_labels(field, mesh), "target:", "got PolyData", "nearest_labels", error=TypeError)
     refused(lambda: kfgs.transfer_labels("run", cloud), "source:", "SemanticField.load", error=TypeError)
+    refused(lambda: kfgs.attach(cloud, field), "field:", "got Gaussians", "SemanticField.load", error=TypeError)
 
 
 def test_6_a_codebook_of_numpy_maps():

@@ -20,7 +20,7 @@ from ..cameras.similarity import Similarity
 from ..gaussians import Gaussians
 from ..splat.transform import transform_gaussians
 from .color import Mode, parse_color, recolor
-from .selection import Rule, Selection, as_rule, class_names, plain_fields, set_fields, three_numbers
+from .selection import Rule, Selection, as_rule, as_selection, class_names, plain_fields, set_fields, three_numbers
 from .transfer import as_cloud
 
 AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
@@ -58,10 +58,9 @@ class OnSelection(Edit):
     def apply(self, gaussians: Gaussians) -> Gaussians:
         """See `Edit.apply`."""
         gaussians = as_cloud(gaussians)
-        rules: tuple[Rule, ...] = self.where  # type: ignore[assignment]  # since __post_init__
-        mask = torch.stack([rule.select(gaussians).mask for rule in rules]).any(dim=0)
+        mask = as_selection(self.where, gaussians).mask
         if not bool(mask.any()):
-            got = f"none from {', '.join(map(repr, rules)):.120}; {_present(gaussians)}"
+            got = f"none from {', '.join(map(repr, self.where)):.120}; {_present(gaussians)}"  # type: ignore[arg-type]
             raise ValueError(f"where: expected a selection of some of {len(gaussians)} Gaussians, got {got}")
         return self._change(gaussians, mask)
 

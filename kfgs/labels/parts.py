@@ -134,7 +134,7 @@ def connected_parts(
 
     Args:
         gaussians: a cloud or a field.
-        selection: a class name, a `Selection`, a rule or a mask [N]; an empty one has no parts.
+        selection: a class name, a `Selection`, a rule, several of these, or a mask [N]; an empty one has no parts.
         cameras: views without distortion, to find the best one of each part.
         distance: Gaussians at most this far apart are connected, in world units; None takes it from their spacing.
         smallest: parts with fewer Gaussians are left out; None: those below 5 % of the largest.

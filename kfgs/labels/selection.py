@@ -10,6 +10,8 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from functools import reduce
+from operator import or_
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar, get_args
 
@@ -305,7 +307,9 @@ KINDS: dict[str, type[Rule]] = {kind.kind: kind for kind in (OfClass, InBox, InS
 
 
 def as_selection(value: Any, gaussians: Gaussians, name: str = "selection") -> Selection:
-    """What a person holds as a selection: a class name, a rule, a `Selection`, or a mask [N] of these Gaussians."""
+    """What a person holds as a selection: a class name, a rule, a `Selection`, a mask [N]; of several, what any selects."""
+    if isinstance(value, list | tuple) and value and isinstance(value[0], str | Rule | Selection):
+        return reduce(or_, (as_selection(part, gaussians, name) for part in value))
     if isinstance(value, Tensor | np.ndarray | list):
         return Selection.of(as_tensor(name, value))
     return value if isinstance(value, Selection) else as_rule(value, name).select(gaussians)

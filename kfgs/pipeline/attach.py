@@ -104,6 +104,8 @@ def attach(
         pixels are removed and 0.969 of the others unchanged; by views 0.995 and 0.970 (the same with true label maps).
         A vote of neighbours for border Gaussians, or the class of the nearest rendered surface, was worse.
     """
+    if not hasattr(field, "label"):
+        raise TypeError(f"field: expected a SemanticField, got {type(field).__name__}; SemanticField.load opens one")
     splats = read_splats(splats) if isinstance(splats, str | Path) else splats
     cameras = list(cameras or field.cameras)
     by = by or ("views" if cameras else "distance")

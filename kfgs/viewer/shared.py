@@ -242,7 +242,7 @@ def _numbered(edits: Iterable[Edit], cloud: Gaussians) -> list[dict[str, Any]]:
                 f"edits[{place}]: expected {', '.join(EDITS)} (without rotation, scale and mode 'hue'), got {edit!r:.80}; "
                 "apply it to the Gaussians, and explore the result"
             )
-        mask = torch.stack([rule.select(cloud).mask for rule in edit.where]).any(dim=0)  # type: ignore[attr-defined]
+        mask = as_selection(edit.where, cloud).mask  # type: ignore[attr-defined]
         rows = numbers[mask].tolist()
         cloud = edit.apply(cloud)
         if edit.op == "remove":

@@ -126,8 +126,8 @@ def cloud_colors(
         check_shapes(("gaussians", gaussians.opacities, "N"), ("color_by", values, "N 3"))
         return CloudColors(as_bytes(values), "rgb", None, None)
     check_shapes(("gaussians", gaussians.opacities, "N"), ("color_by", values, "N"))
-    if np.issubdtype(values.dtype, np.floating):
-        return _scale("score", values, clim, cmap)
+    if values.dtype.kind in "fb":  # of a mask, 0 and 1
+        return _scale("score", values * 1.0, clim, cmap)
     if not np.issubdtype(values.dtype, np.integer):
         raise TypeError(f"color_by: expected labels (integers) or scores (floats), got {values.dtype}; convert it")
     return CloudColors(palette(values), "label", values.astype(np.int64), None)

@@ -48,7 +48,7 @@ def test_what_cannot_be_drawn_is_named(plotter, monkeypatch):
     refused(lambda: draw(style="spheres"), "style:", "'points', 'gaussians'", "got 'spheres'")
     refused(lambda: draw(color_by="colour"), "color_by:", "'rgb'", "'class 4'", "got 'colour'")
     refused(lambda: draw(color_by=torch.zeros(59)), "color_by:", "[N]", "N = 60", "got (59,)")
-    refused(lambda: draw(color_by=scores.bool()), "color_by:", "got bool", error=TypeError)
+    assert data(draw(color_by=gaussians.labels == 2))["score"].tolist() == (gaussians.labels == 2).double().tolist()
     refused(lambda: draw(color_by=scores, clim=(1.0, 1.0)), "clim[1]:", "got 1.0")
     refused(lambda: draw(color_by="view"), "color_by:", "'rgb'", "'points'", "got 'view'")
     refused(lambda: add_cloud(plotter, faint, style="ellipsoids"), "gaussians:", "above 0.5", "got 0")
