@@ -14,6 +14,7 @@ const BACKGROUND = { light: [0.957, 0.961, 0.969], dark: [0.094, 0.102, 0.118] }
 const ROLL = Math.PI / 36; // radians
 const GLIDE = 350; // milliseconds of a move to another view
 const SAID = 9000; // milliseconds that a message stays
+const MOST_BYTES = 2 ** 29 - 2 ** 16; // of a file to open: LONGEST_FILE of server.py with what is sent with it
 const BRUSH = [6, 120]; // pixels: smallest and largest radius
 const NARROW = { narrow: 900, slim: 640, thin: 480 }; // CSS pixels of the width
 const LOW = 420; // of the height
@@ -119,7 +120,9 @@ class App {
     const keys = this.alone ? document : this.root; // on a page of its own: wherever the focus is
     listen(keys, "keydown", (event) => this.key(event));
     listen(keys, "keyup", (event) => this.tools.release(event));
-    listen(window, "blur", () => this.tools.releaseAll());
+    listen(window, "blur", () => this.tools.keys.clear());
+    listen(this.root, "dragover", (event) => event.preventDefault());
+    listen(this.root, "drop", (event) => (event.preventDefault(), this.openFile(event.dataTransfer.files[0])));
     listen(window, "beforeunload", (event) => this.alone && this.model.edited && event.preventDefault()); // the tab may close
     this.dispose = () => {
       until.abort();
@@ -298,9 +301,13 @@ class App {
     return JSON.stringify({ ...this.model.toJSON(), mode: this.panes.list[0].mode, view: this.eye.view });
   }
 
+  /** Open a state that was saved; or a file of splats, through Python, in place of the scene. */
   openFile(file) {
     return file && this.attempt(async () => {
-      await this.open(await new Response(file).json().catch(() => null));
+      if (/\.json$/i.test(file.name)) return this.open(await new Response(file).json().catch(() => null));
+      if (file.size > MOST_BYTES) throw new Error(`${file.name} is too large for this page: run “kfgs view ${file.name}”.`);
+      this.say(`Opening ${file.name} …`);
+      location.assign(`../${await this.link.openFile(file)}/`);
     });
   }
 

@@ -23,7 +23,7 @@ const HELP = [
   ["/", "search"], ["M", "next colour mode"], ["1 2 3 4", "move, box, lasso, brush"], ["5", "drag the selection (Shift: up and down)"], ["6", "measure: click two places"], [", .", "smaller and larger brush"],
   ["Shift or Alt + tool", "add to or subtract from the selection"], ["X", "select through: also what others hide"], ["Delete", "remove the selection"],
   ["Ctrl + I", "invert the selection"], ["Ctrl + Z, Ctrl + Shift + Z", "undo, redo"],
-  ["Escape", "move tool, then clear the selection"],
+  ["Escape", "move tool, then clear the selection"], ["Drop a file", "open a splat (kfgs view), or a saved state"],
 ];
 
 /** The bar at the top. Returns {element, refresh()}. */

@@ -124,10 +124,3 @@ export function frame(gl, textures, depth = null) {
   gl.drawBuffers(places.length ? places : [gl.NONE]);
   return made;
 }
-
-/** Bytes of red, green, blue with an opaque alpha. */
-export function withAlpha(rgb) {
-  const made = new Uint8Array((rgb.length / 3) * 4).fill(255);
-  for (let i = 0; i < rgb.length / 3; i++) made.set(rgb.subarray(3 * i, 3 * i + 3), 4 * i);
-  return made;
-}

@@ -25,6 +25,12 @@ export class OfflineLink {
     if (!found) throw new Error(explain(words, this.names, NEEDS_PYTHON));
     return { ...found, words: name, scores: bufferOf(this.packed, found.buffer) };
   }
+
+  /** The secret in the address of a page that shows a file of splats. */
+  async openFile(file) {
+    if (this.call !== callPage) throw new Error(`Only a page of “kfgs view” opens files: run “kfgs view ${file.name}”.`);
+    return (await this.call("open", { name: file.name }, file))[0].secret;
+  }
 }
 
 /** The class that is meant: found exactly, then without regard to case if only one spelling fits; else null. */

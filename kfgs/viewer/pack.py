@@ -22,13 +22,11 @@ from ..cameras import Camera
 from ..formats.encodings import pack_smallest_three
 from ..gaussians import Gaussians
 from ..scenes import Scene
-from ..splat.sh import SH_C0
 from ..viz.colors import COLORMAP, Array
 from ..viz.films import show_photos
 from ..viz.palette import palette
-from .state import GREY, Exploration, Side
+from .state import Exploration, Side
 
-VERSION = 1
 ALIGN = 16  # bytes: an offset at which JavaScript may start an array of any type
 MEAN_STEPS = (1 << 21) - 1  # 21 bits for each coordinate
 SCALE_RANGE = 12.0  # in log units: smaller scales are far below a pixel and become the smallest one
@@ -36,6 +34,7 @@ DC_STEPS = (1 << 10) - 1
 # Of the harmonics above degree 0. 1/32 is 2 dB better (room_0: 50 instead of 48 dB), with 2 to 3 bytes a Gaussian more.
 SH_STEP = 1 / 20
 SH_PLANES = {0: 0, 1: 2, 2: 3, 3: 6}  # texels of 8 bytes that hold the coefficients above degree 0
+Buffers = dict[str, Array]
 PHOTO = 400  # pixels: the longer edge of a photo in the page, about 20 KB
 
 
@@ -61,25 +60,16 @@ class Packed(NamedTuple):
         return zlib.compress(b"".join([*parts, self.data[end:]]), level)
 
 
-class _Buffers:
-    """Collects arrays, each at a multiple of 16 bytes."""
-
-    def __init__(self) -> None:
-        self.table: dict[str, dict[str, Any]] = {}
-        self._parts: list[bytes] = []
-        self._size = 0
-
-    def add(self, name: str, array: Array) -> None:
-        array = np.ascontiguousarray(array)
-        content = array.astype(array.dtype.newbyteorder("<"), copy=False).tobytes()
-        entry = {"offset": self._size, "length": len(content), "type": array.dtype.name, "shape": list(array.shape)}
-        self.table[name] = entry
-        padding = -len(content) % ALIGN
-        self._parts += [content, bytes(padding)]
-        self._size += len(content) + padding
-
-    def joined(self) -> bytes:
-        return b"".join(self._parts)
+def _joined(buffers: Buffers) -> tuple[dict[str, dict[str, Any]], bytes]:
+    """All arrays as one block of bytes, each at a multiple of 16, and where each one is."""
+    table: dict[str, dict[str, Any]] = {}
+    parts, size = [], 0
+    for name, array in buffers.items():
+        content = np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("<")).tobytes()
+        table[name] = {"offset": size, "length": len(content), "type": array.dtype.name, "shape": list(array.shape)}
+        parts += [content, bytes(-len(content) % ALIGN)]
+        size += len(content) + len(parts[-1])
+    return table, b"".join(parts)
 
 
 def pack_scene(state: Exploration, *, title: str = "kfgs", scene: Scene | None = None) -> Packed:
@@ -90,28 +80,27 @@ def pack_scene(state: Exploration, *, title: str = "kfgs", scene: Scene | None =
     """
     from matplotlib import colormaps
 
-    buffers, meaning, asked = _Buffers(), state.meaning, state.asked
+    meaning, asked = state.meaning, state.asked
+    buffers: Buffers = {}
     sides = {side: _add_side(buffers, state, side) for side in state.sides}
     labels = state.labels("semantic")
     scores = np.where(labels >= 0, as_array(meaning.scores).astype(np.float32), np.float32("nan"))
-    buffers.add("semantic/labels", labels.astype(np.int16))
-    buffers.add("semantic/label_scores", scores.astype(np.float32))
+    buffers["semantic/labels"] = labels.astype(np.int16)
+    buffers["semantic/label_scores"] = scores.astype(np.float32)
     if "latents" in state.show_choices:
-        buffers.add("semantic/latents", state.latents)
+        buffers["semantic/latents"] = np.insert(state.latents, 3, 255, axis=1)  # opaque: textures have four channels
     if "color" in state.sides:
-        buffers.add("color/source", state.source.astype(np.int32))
-        buffers.add("color/far", rounded_far(state.far, state.distance))
-    buffers.add("colormap", colormaps[COLORMAP](np.arange(256), bytes=True)[:, :3])
+        buffers["color/source"] = state.source.astype(np.int32)
+        buffers["color/far"] = rounded_far(state.far, state.distance)
+    buffers["colormap"] = colormaps[COLORMAP](np.arange(256), bytes=True)
     low, high = state.distance_range
     colors = palette(torch.arange(len(meaning.names)), meaning.names)
     header = {
-        "version": VERSION,
         "title": title,
         "origin": list(meaning.gaussians.origin),
         "sides": sides,
         "classes": [{"name": name, "color": rgb.tolist()} for name, rgb in zip(meaning.names, colors, strict=True)],
         "lambda": {"value": state.distance, "how": state.distance_how, "low": low, "high": high},
-        "by": meaning.by,
         "phrases": meaning.phrases,
         "examples": meaning.examples,
         "clim": list(state.clim) if asked is None else [0.0, 1.0],
@@ -128,32 +117,33 @@ def pack_scene(state: Exploration, *, title: str = "kfgs", scene: Scene | None =
             "gamma": state.gamma,
         },
         "things": state.things,
-        "buffers": buffers.table,
     }
-    return Packed(header, buffers.joined())
+    header["buffers"], data = _joined(buffers)
+    return Packed(header, data)
 
 
-def _add_side(buffers: _Buffers, state: Exploration, side: Side) -> dict[str, Any]:
+def _add_side(buffers: Buffers, state: Exploration, side: Side) -> dict[str, Any]:
     """Add the splats of a side; returns what is needed to decode them."""
     cloud = state.cloud(side)
     for name in ("quats", "scales", "opacities", "sh"):  # JSON has no NaN, and one would spoil the steps of all others
         if (values := getattr(cloud, name)) is not None:
             check_finite(f"{side}.{name}", values)
     places = as_array(cloud.means).astype(np.float64)
-    center, half = core_box(places)
+    low, high = np.quantile(places, [0.01, 0.99], axis=0)  # outside twice this box, steps grow with the distance
+    center, half = (low + high) / 2, np.maximum(high - low, 1e-6)
     log_scales = np.log(np.maximum(as_array(cloud.scales).astype(np.float64), 1e-30))
     highest = float(log_scales.max())
     lowest = max(float(log_scales.min()), highest - SCALE_RANGE)
     step = max(highest - lowest, 1e-6) / 255
-    buffers.add(f"{side}/splats", pack_splats(cloud, center, half, lowest, step))
+    buffers[f"{side}/splats"] = pack_splats(cloud, center, half, lowest, step)
     degree = 0 if cloud.sh is None else int(cloud.sh.shape[1] ** 0.5) - 1
-    base = _base_colors(state, side)
+    base = state.base_colors(side)
     dc_low, dc_high = min(float(base.min()), 0.0), max(float(base.max()), 1.0)  # room for new colours
     dc_step = max(dc_high - dc_low, 1e-6) / DC_STEPS
-    buffers.add(f"{side}/dc", pack_dc(base, dc_low, dc_step))
+    buffers[f"{side}/dc"] = pack_dc(base, dc_low, dc_step)
     if degree:
         assert cloud.sh is not None
-        buffers.add(f"{side}/sh", pack_sh(as_array(cloud.sh), SH_STEP))
+        buffers[f"{side}/sh"] = pack_sh(as_array(cloud.sh), SH_STEP)
     return {
         "count": len(cloud),
         "sh_degree": None if cloud.sh is None else degree,
@@ -194,12 +184,6 @@ def find_focus(state: Exploration) -> list[float] | None:
     over = (heights > top) & (heights < top + 2 * reach) & (aside < reach)
     looks = ((point - centers) * axes).sum(1) > 0.9 * far
     return point.tolist() if looks.mean() >= 0.9 and over.mean() < 0.01 else None
-
-
-def core_box(means: Array) -> tuple[Array, Array]:  # [N, 3] -> [3], [3]
-    """Centre and half-size of twice the box of the middle 98 % of the means; outside it, steps grow with the distance."""
-    low, high = np.quantile(means, [0.01, 0.99], axis=0)
-    return (low + high) / 2, np.maximum(high - low, 1e-6)
 
 
 def pack_splats(
@@ -243,28 +227,19 @@ def pack_sh(sh: Array, step: float) -> Array:  # [N, K, 3] -> [planes, N, 2] uin
     return rows.view("<u4").reshape(N, planes, 2).transpose(1, 0, 2)
 
 
-def _base_colors(state: Exploration, side: Side) -> Array:  # [N, 3] float64
-    """The colour of degree 0; of a cloud without harmonics, that of the other side."""
-    cloud = state.cloud(side)
-    if cloud.sh is not None:
-        return as_array(cloud.sh[:, 0]).astype(np.float64) * SH_C0 + 0.5
-    if "rgb" in state.show_choices:
-        return state.base_colors(side).astype(np.float64) / 255
-    return np.full((len(cloud), 3), GREY[0] / 255)
-
-
-def _add_scores(buffers: _Buffers, state: Exploration, questions: Iterable[str]) -> dict[str, dict[str, Any]]:
+def _add_scores(buffers: Buffers, state: Exploration, questions: Iterable[str]) -> dict[str, dict[str, Any]]:
     """Add the score of each question, and return what the answer suggests, by name."""
     answers: dict[str, dict[str, Any]] = {}
     for words in questions:
         answer, scores = state.meaning.ask(words).packed()
         if answer["words"] not in answers:
-            buffers.add(name := f"scores/{len(answers)}", np.frombuffer(scores, np.float32))
+            name = f"scores/{len(answers)}"
+            buffers[name] = np.frombuffer(scores, np.float32)
             answers[answer["words"]] = answer | {"buffer": name}
     return answers
 
 
-def _add_cameras(buffers: _Buffers, state: Exploration, scene: Scene | None) -> list[dict[str, Any]]:
+def _add_cameras(buffers: Buffers, state: Exploration, scene: Scene | None) -> list[dict[str, Any]]:
     """Add the photos of the cameras that have one, and describe all cameras."""
     paths = [] if scene is None else zip(scene.cameras, scene.image_paths, strict=True)
     there, packed = {camera.name for camera, path in paths if path.is_file()}, []
@@ -273,7 +248,7 @@ def _add_cameras(buffers: _Buffers, state: Exploration, scene: Scene | None) -> 
         name = None
         if show is not None and camera.name in there:
             name = f"thumbnails/{index}"
-            buffers.add(name, np.frombuffer(as_jpeg(show(camera.fitted(PHOTO))), dtype=np.uint8))
+            buffers[name] = np.frombuffer(as_jpeg(show(camera.fitted(PHOTO))), dtype=np.uint8)
         packed.append(pack_camera(camera) | {"thumbnail": name})
     return packed
 

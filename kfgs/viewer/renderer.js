@@ -3,7 +3,7 @@
  * are textures, so that gamma, lambda, hidden classes and modes change with a uniform and without Python.
  */
 import {UNKNOWN, bufferOf, cloudsOf} from "./clouds.js";
-import {bind, fill, frame, program, rectangles, row, sheet, solid, texture, withAlpha} from "./gl.js";
+import {bind, fill, frame, program, rectangles, row, sheet, solid, texture} from "./gl.js";
 import {BATCH, COVERED, FINISH, PREPARE, SOLID_FRAGMENT, SOLID_VERTEX, SPLAT_FRAGMENT, SPLAT_VERTEX, WHOLE, WIDTH} from "./shaders.js";
 import {startSorter} from "./sorter.js";
 
@@ -88,8 +88,8 @@ export class Renderer {
     this.shared = {
       labels: sheet(gl, gl.R16I, labels.length, labels),
       scores: sheet(gl, gl.R32F, labels.length, null),
-      latents: sheet(gl, gl.RGBA8, labels.length, latents ? withAlpha(latents) : null),
-      colormap: row(gl, withAlpha(bufferOf(packed, "colormap"))),
+      latents: sheet(gl, gl.RGBA8, labels.length, latents),
+      colormap: row(gl, bufferOf(packed, "colormap")),
       classes: row(gl, new Uint8Array(4 * (this.names.length + 1))),
     };
     Object.values(clouds).forEach((cloud) => this.#addSide(cloud));

@@ -15,17 +15,19 @@ import struct
 import sys
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
+from functools import partial
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from ipaddress import ip_address
 from threading import Thread
 from typing import Any
-from urllib.parse import SplitResult, urlsplit
+from urllib.parse import urlsplit
 
 from .._card import error_line
 from .._files import parse_json
 
-REFUSED = "This page opens with the whole link that kfgs gave.\n"
 LONGEST_CALL = 16 << 20  # bytes: a selection of many million Gaussians, as bits
+LONGEST_FILE = 1 << 29  # bytes of a call that opens a file; app.js has the same number
+MOST_SCENES = 4  # that a server holds, in the memory of Python: its own, and the last that were opened
 PATIENCE = 60.0  # seconds after which a connection that neither sends nor reads is closed
 POLICY = (
     "default-src 'none'; script-src 'unsafe-inline' blob:; style-src 'unsafe-inline'; img-src 'self' blob: data:; "
@@ -42,14 +44,20 @@ class PageServer(AbstractContextManager["PageServer"]):
     A call is a POST to `call`: 4 bytes with the length of a JSON text (little-endian), the JSON {"name", "args"}, and
     attached bytes; the answer has the same form. With a host that other machines can reach, everyone who has the link can
     look and save. Port 0 is a free one; a ValueError if it is taken, or the host is not one of this machine.
+
+    The call "open", with the name of a file and its bytes, is answered with the secret of a page that shows it, which
+    `open_file` makes. Only a page that this machine alone can reach may open files.
     """
 
-    def __init__(self, document: str, pack: bytes, call: Call, host: str = "127.0.0.1", port: int = 0) -> None:
+    def __init__(
+        self, document: str, pack: bytes, call: Call, host: str = "127.0.0.1", port: int = 0,
+        *, open_file: Callable[[str, bytes], tuple[str, bytes, Call]] | None = None,
+    ) -> None:  # fmt: skip
         if not host.strip():
             raise ValueError(f"host: expected an address of this machine, got {host!r}; for instance 127.0.0.1")
-        self.secret = secrets.token_urlsafe(24)
-        self.files = {"": ("text/html; charset=utf-8", document.encode()), "pack": ("application/octet-stream", pack)}
-        self.call, self._host = call, host
+        self.scenes: dict[str, tuple[dict[str, tuple[str, bytes]], Call]] = {}
+        self.secret = self.add(document, pack, call)
+        self._host, self._open_file = host, open_file
         handler = type("Handler", (_Handler,), {"page": self})
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
         try:
@@ -61,6 +69,22 @@ class PageServer(AbstractContextManager["PageServer"]):
             ) from error
         self._thread = Thread(target=self._server.serve_forever, name="kfgs-page", daemon=True)
         self._thread.start()
+
+    def add(self, document: str, pack: bytes, call: Call) -> str:
+        """Serve one more page, and no longer the first of those that were added if they are too many; returns its secret."""
+        secret = secrets.token_urlsafe(24)
+        files = {"": ("text/html; charset=utf-8", document.encode()), "pack": ("application/octet-stream", pack)}
+        if len(self.scenes) == MOST_SCENES:
+            del self.scenes[list(self.scenes)[1]]
+        self.scenes[secret] = files, partial(self._call, call)
+        return secret
+
+    def _call(self, own: Call, name: str, args: dict[str, Any], attached: bytes) -> tuple[dict[str, Any], bytes]:
+        if name != "open":
+            return own(name, args, attached)
+        if self._open_file is None or not self.local:
+            raise ValueError("file: expected a page that only this machine can open, got another; run `kfgs view FILE`")
+        return {"secret": self.add(*self._open_file(str(args.get("name")), attached))}, b""
 
     @property
     def url(self) -> str:
@@ -143,32 +167,34 @@ class _Handler(BaseHTTPRequestHandler):
     def do_GET(self) -> None:
         name = self._name()
         if name is not None:
-            missing = "text/plain", b"There is no such file.\n"
-            self._answer(200 if name in self.page.files else 404, *self.page.files.get(name, missing))
+            files, missing = self.scene[0], ("text/plain", b"There is no such file.\n")
+            self._answer(200 if name in files else 404, *files.get(name, missing))
 
     def do_POST(self) -> None:
         name = self._name()
         if name is None:
             return
-        length = self.headers.get("Content-Length", "")
-        if name != "call" or not length.isdecimal() or len(length) > 20 or int(length) > LONGEST_CALL:
+        length, longest = self.headers.get("Content-Length", ""), LONGEST_FILE if self.page.local else LONGEST_CALL
+        if name != "call" or not length.isdecimal() or len(length) > 20 or int(length) > longest:
             self._answer(400, "text/plain", b"This address is the page's own.\n")
             return
-        answer = answer_call(self.page.call, lambda: read_message(self.rfile.read(int(length))))
+        answer = answer_call(self.scene[1], lambda: read_message(self.rfile.read(int(length))))
         self._answer(200, "application/octet-stream", pack_message(*answer))
 
     def _name(self) -> str | None:
         """The file asked for; None if the request was refused."""
-        parts = _split(self.path).path.split("/", 2)
         host, origin = self.headers.get("Host", ""), self.headers.get("Origin")
-        allowed = len(parts) == 3 and hmac.compare_digest(parts[1].encode(), self.page.secret.encode())
-        if self.page.local and not is_loopback(_split(f"//{host}").hostname or ""):
-            allowed = False
-        if origin is not None and _split(origin).netloc.lower() != host.lower():
-            allowed = False
-        if allowed:
-            return parts[2]
-        self._answer(403, "text/plain", REFUSED.encode())
+        try:
+            _, asked, name = urlsplit(self.path).path.split("/", 2)
+            machine, source = urlsplit(f"//{host}").hostname or "", urlsplit(origin or f"//{host}").netloc
+        except ValueError:  # too few parts, or brackets that do not match, as in http://[
+            asked, name, machine, source = "", "", "", ""
+        scenes = list(self.page.scenes.items())
+        allowed = [own for secret, own in scenes if hmac.compare_digest(asked.encode(), secret.encode())]
+        if allowed and source.lower() == host.lower() and (not self.page.local or is_loopback(machine)):
+            self.scene = allowed[0]
+            return name
+        self._answer(403, "text/plain", b"This page opens with the whole link that kfgs gave.\n")
         return None
 
     def _answer(self, status: int, kind: str, content: bytes) -> None:
@@ -191,10 +217,3 @@ class _Handler(BaseHTTPRequestHandler):
 
     def log_message(self, *_: Any) -> None:
         """Say nothing: addresses hold the secret."""
-
-
-def _split(address: str) -> SplitResult:
-    try:
-        return urlsplit(address)
-    except ValueError:  # brackets that do not match, as in http://[
-        return urlsplit("")

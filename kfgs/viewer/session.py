@@ -7,10 +7,11 @@ Gaussian of a side, the lowest bit first.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from itertools import count
 from pathlib import Path
 from threading import Lock
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 import torch
@@ -76,7 +77,7 @@ class Session:
         return self.state.meaning.similar(mask).packed()
 
     def _parts(self, args: dict[str, Any], attached: bytes) -> Answer:
-        side = _side(args["side"])
+        side = args["side"]
         cloud = self._edited(side, args)
         (mask,) = _masks({side: len(cloud)}, attached).values()
         parts = connected_parts(cloud, Selection.of(mask, "in the viewer"), most=MOST_PARTS)
@@ -93,12 +94,12 @@ class Session:
             state.set_gamma(args["gamma"])
         if args.get("lambda") is not None:
             state.set_distance(args["lambda"])
-        edited = {side: self._edited(side, args) for side in map(_side, args["sides"])}
+        edited = {side: self._edited(side, args) for side in args["sides"]}
         masks = _masks({side: len(splats) for side, splats in edited.items()}, attached)
         return {"paths": [str(path) for path in save_selection(state, edited, masks, self.out)]}, b""
 
     def _save_edits(self, args: dict[str, Any], _: bytes) -> Answer:
-        made = {_side(side): edits for side in args["edits"] if len(edits := _edits_of(args, side))}
+        made = {side: edits for side, given in args["edits"].items() if len(edits := edit_list(given))}
         if not made:
             raise ValueError("edits: expected at least one, got none; remove or recolour something first")
         if args.get("lambda") is not None:
@@ -112,7 +113,7 @@ class Session:
 
     def _edited(self, side: Side, args: dict[str, Any]) -> Gaussians:
         """A side with what was done to it, but nothing removed: masks are of these Gaussians."""
-        kept = tuple(edit for edit in _edits_of(args, side) if edit.op != "remove")
+        kept = tuple(edit for edit in edit_list(args.get("edits", {}).get(side, [])) if edit.op != "remove")
         return EditList(kept).apply(labelled(self.state, side))
 
 
@@ -133,9 +134,7 @@ def save_selection(
     places = evenly(len(state.cameras), MOST_VIEWS).tolist()
     views = [state.cameras[place] for place in places] or None
     for side in chosen:
-        known = clouds[side].scores
-        assert known is not None
-        scores = torch.nan_to_num(known)
+        scores = torch.nan_to_num(clouds[side].scores)  # type: ignore[arg-type]  # `labelled` gives them
         selection = Selection(masks[side], scores, state.gamma, state.gamma_how or "in the viewer")
         parts = [part.to_json() for part in connected_parts(clouds[side], selection, views, most=MOST_PARTS)]
         for part in parts:
@@ -161,11 +160,10 @@ def labelled(state: Exploration, side: Side) -> Gaussians:
 def next_folder(out: Path, stem: str) -> Path:
     """Make the first free folder `stem_001` in `out`."""
     for number in count(1):
-        try:
-            (out / f"{stem}_{number:03d}").mkdir(parents=True)
-            return out / f"{stem}_{number:03d}"
-        except FileExistsError:
-            continue
+        folder = out / f"{stem}_{number:03d}"
+        with suppress(FileExistsError):
+            folder.mkdir(parents=True)
+            return folder
     raise AssertionError("there is always a next number")
 
 
@@ -180,18 +178,9 @@ def _masks(counts: dict[Side, int], attached: bytes) -> dict[Side, Tensor]:
     return masks
 
 
-def _side(name: str) -> Side:
-    check_choice("side", name, get_args(Side))
-    return name  # type: ignore[return-value]
-
-
 def edit_list(given: list[dict[str, Any]]) -> EditList:
     """Edits as the viewer sends them."""
     for edit in given:
         check_choice("edits: op", edit["op"], EDITS)
         check_choice("edits: where", edit["where"]["kind"], ("index",))
     return EditList(read_edits(given))
-
-
-def _edits_of(args: dict[str, Any], side: str) -> EditList:
-    return edit_list(args.get("edits", {}).get(_side(side), []))

@@ -261,6 +261,5 @@ def _same(a: Any, b: Any) -> bool:
         return a.threshold == b.threshold and torch.equal(a.mask, b.mask)
     if isinstance(a, Camera) and isinstance(b, Camera):
         return pack_camera(a) == pack_camera(b)
-    if isinstance(a, Picked) and isinstance(b, Picked):
-        return repr(a) == repr(b)  # an unknown score is NaN
-    return type(a) is type(b) and bool(a == b)
+    same = type(a) is type(b) and bool(a == b)
+    return same or (isinstance(a, Picked) and repr(a) == repr(b))  # an unknown score is NaN

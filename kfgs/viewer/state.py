@@ -15,7 +15,7 @@ from .._origin import to_world
 from ..cameras import Camera
 from ..gaussians import Gaussians
 from ..labels.transfer import Sources, positions
-from ..splat.sh import sh0_to_rgb
+from ..splat.sh import SH_C0
 from ..viz.colors import Array, FeatureColors, cloud_colors
 from ..viz.linked import upwards
 from ..viz.palette import UNLABELLED, palette
@@ -186,18 +186,20 @@ class Exploration:
             return palette(self.labels(side), self.meaning.names)
         if self.show == "score":
             return cloud_colors(self.cloud(side), self.scores(side), clim=self.clim).rgb
-        return self.base_colors(side) if self.show == "rgb" else self._on(side, self.latents, GREY)
+        return as_bytes(self.base_colors(side)) if self.show == "rgb" else self._on(side, self.latents, GREY)
 
-    def base_colors(self, side: Side) -> Array:  # [N, 3] uint8
-        """The colours of a side from everywhere; if it has none, those of the nearest Gaussians of the other side."""
+    def base_colors(self, side: Side) -> Array:  # [N, 3]
+        """The colours of a side from everywhere, mostly in [0, 1]; without any, the nearest ones of the other side, or grey."""
         if side not in self._base:
             own = self.cloud(side)
             if own.sh is not None:
-                self._base[side] = as_bytes(sh0_to_rgb(own.sh[:, 0].detach()))
-            else:
+                self._base[side] = as_array(own.sh[:, 0]).astype(np.float64) * SH_C0 + 0.5
+            elif "rgb" in self.show_choices:
                 other: Side = "color" if side == "semantic" else "semantic"
                 tree = cKDTree(as_array(self.cloud(other).means), balanced_tree=False, compact_nodes=False)
                 self._base[side] = self.base_colors(other)[tree.query(as_array(own.means), workers=-1)[1]]
+            else:
+                self._base[side] = np.tile(GREY / 255, (len(own), 1))
         return self._base[side]
 
     @cached_property

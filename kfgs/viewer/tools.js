@@ -162,10 +162,6 @@ export class Tools {
     this.fast = event.shiftKey;
   }
 
-  releaseAll() {
-    this.keys.clear();
-  }
-
   fly(before) {
     this.timer = requestAnimationFrame((now) => {
       this.timer = null;

@@ -8,7 +8,8 @@ import webbrowser
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from importlib.util import find_spec
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
+from tempfile import TemporaryDirectory
 from threading import Event
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -18,6 +19,7 @@ from .._check import check_choice
 from .._files import atomic_path
 from ..cameras import Camera
 from ..fields import SemanticField
+from ..formats import read_splats
 from ..gaussians import Gaussians
 from ..labels import LabelSet
 from ..labels.transfer import as_cloud
@@ -28,7 +30,7 @@ from ..viz.plotter import has_display
 from .meaning import FieldMeaning, Meaning, SplatMeaning
 from .pack import as_jpeg, pack_scene
 from .page import APP, document, inline_script, read_text
-from .server import PageServer, answer_call, pack_message
+from .server import Call, PageServer, answer_call, pack_message
 from .session import Session
 from .shared import Shared
 from .state import Exploration
@@ -190,8 +192,24 @@ class Viewer(Shared):
 
     def open_page(self, host: str = "127.0.0.1", port: int = 0) -> PageServer:
         """Serve the page from a thread: `url` of the result is its link, `close()` ends it. Otherwise as `serve`."""
+        return PageServer(*self._served(), host, port, open_file=self._open_file)
+
+    def _served(self) -> tuple[str, bytes, Call]:
         packed = pack_message(*pack_scene(self.state, title=self.title, scene=self.scene))
-        return PageServer(document(self.title), packed, self.session.call, host, port)
+        return document(self.title), packed, self.session.call
+
+    def _open_file(self, name: str, content: bytes) -> tuple[str, bytes, Call]:
+        """Serve the Gaussians of a file that a person dropped on the page; nothing of it stays on the disk."""
+        name = PureWindowsPath(name).name or "file"  # without folders of any system
+        with TemporaryDirectory() as folder:
+            path = Path(folder) / name
+            path.write_bytes(content)
+            try:
+                state = Exploration(SplatMeaning(read_splats(path)))
+            except ValueError as error:
+                raise ValueError(str(error).replace(str(path), name)) from None
+        state.set_show(state.first_show)
+        return Viewer(state, title=Path(name).stem, out=self.session.out)._served()
 
     def save_html(self, path: str | Path) -> Path:
         """Write one file with the scene and the viewer, which opens in any browser with a double click, offline.

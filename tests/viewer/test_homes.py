@@ -8,10 +8,11 @@ import cases_explorer
 import cases_page
 import numpy as np
 import pytest
+import torch
 from cases_page import agree, errors_of, mask, set_slider
 from cases_web import needs_chromium
 
-from kfgs.formats import read_splats
+from kfgs.formats import read_splats, write_splats
 from kfgs.viewer import Exploration, FieldMeaning, Viewer
 
 pytestmark = needs_chromium
@@ -71,7 +72,39 @@ def in_widget(page, state, out):
     widget.close()
 
 
-@pytest.mark.parametrize("home", [in_page, in_file, in_widget], ids=["page", "file", "widget"])
+HOMES = pytest.mark.parametrize("home", [in_page, in_file, in_widget], ids=["page", "file", "widget"])
+DROP = """([name, content]) => {
+  const moved = new DataTransfer();
+  moved.items.add(new File([Uint8Array.from(atob(content), (letter) => letter.charCodeAt(0))], name));
+  document.querySelector(".stage").dispatchEvent(new DragEvent("drop", {dataTransfer: moved, bubbles: true, cancelable: true}));
+}"""
+
+
+@HOMES
+def test_a_file_that_is_dropped_opens_in_a_page_alone(browser, tmp_path, home, monkeypatch):
+    (tmp_path / "temporary").mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "temporary"))
+    write_splats(cases_page.exploration().cloud("color")[torch.arange(450) < 77], tmp_path / "small.ply")
+    content = base64.b64encode((tmp_path / "small.ply").read_bytes()).decode()
+    page = browser.new_page(viewport={"width": 800, "height": 600})
+    errors = errors_of(page)
+    with home(page, cases_page.exploration(), tmp_path / "out"):
+        page.wait_for_selector(".kfgs:not([aria-busy])")
+        page.evaluate(DROP, ["small.ply", content])
+        if home is in_page:
+            page.wait_for_selector(".kfgs:not([aria-busy]) .said:has-text('77 Gaussians')")
+            assert (page.locator("h1").inner_text(), page.evaluate("viewer.model.total('semantic')")) == ("small", 77)
+            page.evaluate(DROP, ["..\\wrong.ply", base64.b64encode(b"no splat").decode()])
+            page.wait_for_selector("[role=alert]:has-text('wrong.ply')")
+            assert str(tmp_path) not in page.locator(".toast").inner_text()
+        else:
+            page.wait_for_selector("[role=alert]:has-text('run “kfgs view small.ply”')")
+    assert list((tmp_path / "temporary").iterdir()) == []
+    page.close()
+    assert errors == []
+
+
+@HOMES
 def test_one_person_everywhere(browser, tmp_path, home):
     state, out = cases_page.exploration(), tmp_path / "out"
     page = browser.new_page(viewport={"width": 800, "height": 600})

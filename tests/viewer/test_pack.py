@@ -1,15 +1,13 @@
 import json
-from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
-from cases_explorer import cloud, line
+from cases_explorer import cloud
 from cases_web import room_state
 from messages import refused
 
-from kfgs.viewer import Exploration, SplatMeaning, pack
+from kfgs.viewer import Exploration, SplatMeaning
 from kfgs.viewer.pack import pack_scene, rounded_far
 
 
@@ -50,21 +48,6 @@ def test_no_source_and_no_harmonics():
     assert packed.header["sides"]["color"]["sh_degree"] is None
     assert packed.header["up"] == [0, -1, 0]
     assert packed.header["default_view"] is None
-
-
-def test_cameras_and_thumbnails(monkeypatch):
-    from cases_explorer import cameras
-
-    monkeypatch.setattr(pack, "show_photos", lambda scene: lambda camera: np.full((*camera.size, 3), 200, np.uint8))
-    scene = SimpleNamespace(cameras=cameras(2), image_paths=[Path(__file__), Path("missing.png")])
-    packed = pack_scene(line(cameras=cameras(3)), scene=scene)
-    first, second, third = packed.header["cameras"]
-    assert first["K"] == [40, 44, 21, 13]
-    assert first["viewmat"][3] == pytest.approx(-0.3)
-    assert bytes(buffer(packed, first["thumbnail"])).startswith(b"\xff\xd8\xff")
-    assert second["thumbnail"] is None
-    assert third["thumbnail"] is None
-    assert packed.header["up"] == [0, -1, 0]
 
 
 @pytest.mark.parametrize("name", ["quats", "scales", "opacities", "sh"])

@@ -9,7 +9,7 @@ from urllib.parse import urlsplit
 import pytest
 from messages import refused
 
-from kfgs.viewer.server import LONGEST_CALL, PageServer, pack_message, read_message
+from kfgs.viewer.server import LONGEST_FILE, PageServer, pack_message, read_message
 
 PAGE, PACK = "<p>page</p>", bytes(range(256))
 GO = threading.Event()  # ends the call "wait" early
@@ -110,6 +110,18 @@ def test_slow_calls_and_tabs_that_stall_hold_up_no_other(server):
             tab.close()
 
 
+def test_pages_of_files_are_few_and_local():
+    made = lambda name, content: (name, content, answer)  # noqa: E731
+    with PageServer(PAGE, PACK, answer, open_file=made) as server:
+        opened = [call(server, "open", {"name": f"page {k}"}, bytes([k]))[0]["secret"] for k in range(5)]
+        found = [ask(server, f"/{one}/pack")[:2] for one in (server.secret, *opened)]
+        assert [status for status, _ in found] == [200, 403, 403, 200, 200, 200]
+        assert [content for _, content in found[3:]] == [b"\2", b"\3", b"\4"]
+        assert ask(server, f"/{opened[4]}/")[1] == b"page 4"
+    with PageServer(PAGE, PACK, answer, "0.0.0.0", open_file=made) as other:
+        assert "only this machine can open" in call(other, "open", {"name": "x"})[0]["error"]
+
+
 def test_closing_leaves_no_thread_behind():
     before = threading.active_count()
     server = PageServer(PAGE, PACK, answer)
@@ -132,7 +144,7 @@ def test_other_pages_names_lengths_and_addresses_are_refused(server):
         ({"Origin": f"http://127.0.0.1:{port}"}, 200), ({"Host": f"localhost:{port}"}, 200),
     ):  # fmt: skip
         assert ask(server, secret(server), **headers)[0] == status
-    for length in (str(LONGEST_CALL + 1), "-5", "9" * 5000):
+    for length in (str(LONGEST_FILE + 1), "-5", "9" * 5000):
         assert ask(server, secret(server) + "call", "POST", b"", **{"Content-Length": length})[0] == 400
     assert ask(server, secret(server) + "pack", "POST", b"")[0] == 400
     refused(lambda: PageServer(PAGE, PACK, answer, host=" "), "host", "127.0.0.1")

@@ -93,7 +93,6 @@ def test_what_is_like_a_selection(session):
         ("save_edits", {"edits": {"color": [{"op": "recolor", "where": index(1), "rgb": [300, 0, 0]}]}}, b"", ["rgb"]),
         ("save_edits", {"edits": {"color": [{"op": "insert", "source": "/etc/passwd"}]}}, b"", ["op"]),
         ("save_edits", {"edits": {"color": [{"op": "remove", "where": "chair"}]}}, b"", ["where"]),
-        ("save_edits", {"edits": {"left": []}}, b"", ["side"]),
         ("save_edits", {"edits": {}}, b"", ["edits"]),
         ("save_selection", {"sides": 5}, b"", ["args", "5"]),
         ("save_edits", {"edits": 5}, b"", ["args", "5"]),

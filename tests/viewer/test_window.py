@@ -58,17 +58,6 @@ def test_both_sides_agree_with_the_rasteriser(explorer, words, show):
         assert agreement(explorer, side) > 38
 
 
-def test_each_verb_changes_the_picture_and_the_state(explorer):
-    before = explorer.screenshot()
-    verbs = explorer.ask, explorer.set_gamma, explorer.set_distance, explorer.set_show, explorer.look_from
-    for act, value in zip(verbs, ("chair", 0.7, 0.05, "score", None), strict=True):
-        act(value)
-        after = explorer.screenshot()
-        assert (after != before).any(axis=2).mean() > 0.002
-        before = after
-    assert (explorer.state.gamma, explorer.state.distance) == (0.7, 0.05)
-
-
 def test_a_selection_is_written_with_its_numbers(explorer, tmp_path):
     refused(lambda: explorer.save_selection(), "selection:", "got none")
     explorer.ask("chair")
