@@ -44,6 +44,8 @@ def plotter():
 
 def test_1_cameras_and_photos_of_a_scene(scene):
     assert [scene[name] for name in ("view_000.png", "view_000")] == scene[:1] * 2
+    assert "view_000" in scene
+    assert "view_0" not in scene
     for camera in scene:
         assert scene.image(camera.name).shape == scene.image(camera).shape == (*camera.size, 3)
         assert camera.R.shape == (3, 3)
@@ -106,7 +108,9 @@ def test_8_several_splats(field, splat, tmp_path):
 
 
 def test_9_a_label_map_with_a_legend(scene, field):
-    labels = field.segment(scene.cameras[0])
+    labels = field.segment(scene[0])
+    assert labels.equal(field.segment(scene[0].name.removesuffix(".png")))
+    refused(lambda: field.segment("view"), "camera:", "got 'view'", "did you mean 'view_")
     pictures = [
         viz.overlay_labels(scene.image(0), labels, n) for n in (field.names, field.classes, field, field.label())
     ]

@@ -218,7 +218,7 @@ def unit_vector(name: str, vector: Tensor | Sequence[float]) -> Tensor:  # [3] f
 
 def view_named(cameras: Sequence[Camera], view: str | Camera, where: str) -> Camera:
     """The one camera of a name, with or without its ending; a camera is itself. Errors begin with `where`."""
-    if isinstance(view, Camera):
+    if not isinstance(view, str):
         return view
     names = _names(tuple(camera.name for camera in cameras))
     if (name := names.find(view)) is None:

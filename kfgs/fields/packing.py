@@ -117,8 +117,7 @@ def unpack(streams: dict[str, Tensor], entries: dict[str, Entry]) -> dict[str, T
     """The tensors of `pack`; a ValueError for what is damaged."""
     if set(entries) != set(streams):
         raise ValueError(f"expected a description of {sorted(streams)}, got {sorted(entries)!r:.200}")
-    plain = {name: _plain_bytes(streams[name].numpy().tobytes(), entry) for name, entry in entries.items()}
-    tensors = {name: _decode(entry, plain[name]) for name, entry in entries.items()}
+    tensors = {name: _decode(entry, streams[name].numpy().tobytes()) for name, entry in entries.items()}
     if entries["gaussians.opacities"]["coding"] != "exact":
         tensors["gaussians.opacities"].clamp_(EDGE, 1 - EDGE)
     scales = entries["gaussians.scales"]
@@ -191,18 +190,13 @@ def _rows(values: Array, share: float, coding: str = "rows") -> tuple[Entry, byt
     return entry, steps.tobytes() + plain
 
 
-def _plain_bytes(stream: bytes, entry: Entry) -> bytes:
-    """A stream as it was before compression; a ValueError if it would unpack to more than any packed tensor has."""
-    if not entry["compressed"]:
-        return stream
-    size = zstandard.get_frame_parameters(stream).content_size
-    if size > most_unpacked(len(stream)):
-        raise ValueError(f"a stream of {len(stream)} bytes would unpack to {size}")
-    return zstandard.ZstdDecompressor().decompress(stream, max_output_size=size)
-
-
 def _decode(entry: Entry, plain: bytes) -> Tensor:
-    """The tensor of an entry and its plain bytes."""
+    """The tensor of an entry and its stream; a ValueError if that would unpack to more than any packed tensor has."""
+    if entry["compressed"]:
+        size = zstandard.get_frame_parameters(plain).content_size
+        if size > most_unpacked(len(plain)):
+            raise ValueError(f"a stream of {len(plain)} bytes would unpack to {size}")
+        plain = zstandard.ZstdDecompressor().decompress(plain, max_output_size=size)
     coding, shape = entry["coding"], tuple(entry["shape"])
     if coding == "exact":
         dtype = getattr(torch, entry["dtype"])

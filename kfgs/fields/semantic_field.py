@@ -14,6 +14,7 @@ from .._card import html_card
 from .._check import as_tensor, check_shapes, check_whole
 from .._rows import unit_embeddings, unit_rows
 from ..cameras import Camera
+from ..cameras.camera import view_named
 from ..gaussians import Gaussians, as_rows
 from ..labels import LabelSet, Selection
 from ..labels.classify import Classification
@@ -134,17 +135,20 @@ class SemanticField:
 
     # Maps
 
-    def render(self, camera: Camera, *, engine: str = "auto") -> Rendering:
-        """The latent map F_r (Eq. 3) from a viewpoint, with its alpha. No gradient."""
+    def render(self, camera: Camera | str, *, engine: str = "auto") -> Rendering:
+        """The latent map F_r (Eq. 3) from a viewpoint, with its alpha. No gradient.
+
+        Here and below, a viewpoint is a camera, or the name of one of the field's own: `field.segment("f01")`.
+        """
         with torch.no_grad():
-            return rasterize(self.gaussians, camera, engine=engine)
+            return rasterize(self.gaussians, view_named(self.cameras, camera, "camera"), engine=engine)
 
     def decode(self, latents: Tensor) -> Tensor:  # [..., d] -> [..., D]
         """Decode latents to the teacher's space (Psi of Sec. 3.3.2, or B z); features are returned unchanged."""
         with torch.no_grad():
             return self.decoder.decode(as_tensor("latents", latents, floating=True))
 
-    def feature_map(self, camera: Camera) -> Tensor:  # [H, W, D]
+    def feature_map(self, camera: Camera | str) -> Tensor:  # [H, W, D]
         """Render the teacher's features from a viewpoint. 512 channels at 640x480 take 630 MB."""
         return self.decode(self.render(camera).map)
 
@@ -213,15 +217,17 @@ class SemanticField:
         against = cosines[:, 1:] if len(rows) > 1 else None
         return select_by_similarity(cosines[:, 0], against, threshold, latents.any(dim=1), score)
 
-    def segment(self, camera: Camera, classes: Classes | None = None) -> Tensor:  # [H, W] int64
+    def segment(self, camera: Camera | str, classes: Classes | None = None) -> Tensor:  # [H, W] int64
         """The class of each pixel from a viewpoint, -1 for empty pixels; the rule is that of the decoder."""
         return self.rank(camera, classes, early=True).labels[..., 0]
 
-    def rank(self, camera: Camera, classes: Classes | None = None, *, top: int = 1, early: bool = False) -> Ranked:
+    def rank(
+        self, camera: Camera | str, classes: Classes | None = None, *, top: int = 1, early: bool = False
+    ) -> Ranked:
         """The `top` best classes of each pixel by the rule of `segment`, and their scores.
 
         Args:
-            camera: the viewpoint.
+            camera: the viewpoint, as for `render`.
             classes: as for `classify`.
             top: how many, from 1 to the number of classes.
             early: for labels alone, in less time; scores and opacities are then as far as they were needed.
@@ -236,7 +242,7 @@ class SemanticField:
         with torch.no_grad():
             votes = self._votes(rows)
             if votes is not None:
-                return rank_votes(self.gaussians, camera, votes, top, early=early)
+                return rank_votes(self.gaussians, view_named(self.cameras, camera, "camera"), votes, top, early=early)
             rendering = self.render(camera)
             unit = unit_embeddings(rows).to(self.latents)
             labels = self.decoder.label_pixels(rendering.map, unit, top, rendering.alpha > 0)

@@ -44,9 +44,8 @@ def find_points(scene: Scene, *, config: SfmConfig | None = None, progress: bool
     if count < 2:
         raise SceneError(f"scene: expected at least 2 views to triangulate points, got {count}; add pictures")
     seen = scene.select(np.linspace(0, len(scene) - 1, count).round().astype(int).tolist())
-    for path in seen.image_paths:
-        if not path.is_file():
-            raise FileNotFoundError(f"{path}: no such file; expected a picture of the scene there")
+    for path in (path for path in seen.image_paths if not path.is_file()):
+        raise FileNotFoundError(f"{path}: no such file; expected a picture of the scene there")
     what = "scene: expected pictures that fit their poses"
     advice = "check the pictures, or estimate the poses again (`kfgs sfm --ignore-poses`)"
     with tempfile.TemporaryDirectory(prefix="kfgs-points-") as scratch:

@@ -127,8 +127,7 @@ def _is_transforms(path: Path) -> bool:
 def is_scene(path: str | Path) -> bool:
     """Whether a folder has poses: a COLMAP model, a transforms.json, or the layout of a data set."""
     path = as_path(path)
-    has_poses = path.is_dir() and (_is_transforms(path) or find_layout(path) is not None)
-    return has_poses or find_model(path) is not None
+    return (path.is_dir() and (_is_transforms(path) or find_layout(path) is not None)) or find_model(path) is not None
 
 
 def _find_images(root: Path, model: Path) -> Path:
@@ -193,5 +192,5 @@ def _above(model: Path) -> list[Path]:
 
 
 def _folders(folder: Path) -> list[Path]:
-    inner = [below for below in folder.iterdir() if below.is_dir()] if folder.is_dir() else []
+    inner = filter(Path.is_dir, folder.iterdir() if folder.is_dir() else ())
     return sorted(inner, key=lambda below: natural_key(below.name))

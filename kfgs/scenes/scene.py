@@ -83,6 +83,9 @@ class Scene(Sequence[Camera]):
         """The camera of a view, by its name or index as in `index`; of a slice, a list."""
         return self.cameras[view if isinstance(view, slice) else self.index(view)]
 
+    def __contains__(self, view: object) -> bool:
+        return any(view in (camera, camera.name, file_stem(camera.name)) for camera in self.cameras)
+
     def index(self, view: int | str | Camera) -> int:  # type: ignore[override]  # that of a list has a start and an end
         """The index of a view from its name (with or without folder and suffix), camera or index; errors offer the nearest."""
         if isinstance(view, str | Camera):
@@ -187,8 +190,7 @@ class Scene(Sequence[Camera]):
 
         3DGS scales the steps of positions with this length. If the `train` split is empty, all views count.
         """
-        chosen = self.splits.get("train") or range(len(self))
-        return camera_extent([self.cameras[i] for i in chosen], self.points)
+        return camera_extent([self.cameras[i] for i in self.splits.get("train") or range(len(self))], self.points)
 
     def with_near(self) -> Scene:
         """The same scene with every camera's `near` at 0.2 world units or, if that is less, a tenth of the extent.
