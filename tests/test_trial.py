@@ -44,8 +44,7 @@ def plotter():
 
 def test_1_cameras_and_photos_of_a_scene(scene):
     assert [scene[name] for name in ("view_000.png", "view_000")] == scene[:1] * 2
-    assert "view_000" in scene
-    assert "view_0" not in scene
+    assert ["view_000" in scene, "view_0" in scene, scene[1] in scene] == [True, False, True]
     for camera in scene:
         assert scene.image(camera.name).shape == scene.image(camera).shape == (*camera.size, 3)
         assert camera.R.shape == (3, 3)
@@ -74,9 +73,7 @@ def test_4_boxes_of_chairs_as_json(field, tmp_path):
     ruled = kfgs.connected_parts(field, OfClass("chair"))
     assert parts[0].count == ruled[0].count
     columns = {name: column for name, column in field.label().to_numpy().items() if column.ndim == 1}  # for pandas
-    assert {name: len(column) for name, column in columns.items()} == dict.fromkeys(
-        ("opacities", "labels", "scores"), len(field)
-    )
+    assert set(columns) == {"opacities", "labels", "scores"}
     assert abs(asked[0].count - parts[0].count) <= 5
 
 
