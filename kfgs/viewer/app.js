@@ -305,7 +305,7 @@ class App {
   openFile(file) {
     return file && this.attempt(async () => {
       if (/\.json$/i.test(file.name)) return this.open(await new Response(file).json().catch(() => null));
-      if (file.size > MOST_BYTES) throw new Error(`${file.name} is too large for this page: run “kfgs view ${file.name}”.`);
+      if (file.size > MOST_BYTES) throw new Error(`${file.name} is too large here: run “kfgs view ${file.name}”.`);
       this.say(`Opening ${file.name} …`);
       location.assign(`../${await this.link.openFile(file)}/`);
     });
@@ -509,7 +509,8 @@ class App {
     const { model, panes } = this;
     const { parts, name, side } = model.parts ?? { parts: [] };
     const boxes = parts.map(({ corners }, at) => ({ name: `${name} ${at + 1}`, places: corners }));
-    const tape = model.tape.length ? [{ name: model.length === null ? "" : short(model.length), places: model.tape }] : [];
+    const length = model.length === null ? "" : short(model.length);
+    const tape = model.tape.length ? [{ name: length, places: model.tape }] : [];
     const shown = panes.layout === "slider" ? panes.list.slice(0, 1) : panes.list;
     const project = (place) => panes.project(place);
     this.boxes.replaceChildren(...shown.map((pane) => {

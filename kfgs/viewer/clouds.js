@@ -3,10 +3,7 @@
 import { luminance, tint, weightedMedian } from "./tint.js";
 
 const MEAN_STEPS = 2 ** 21 - 1;
-const ARRAYS = {
-  float32: Float32Array, float64: Float64Array, uint32: Uint32Array, int32: Int32Array,
-  uint16: Uint16Array, int16: Int16Array, uint8: Uint8Array, int8: Int8Array,
-};
+const ARRAYS = { float32: Float32Array, uint32: Uint32Array, int32: Int32Array, int16: Int16Array, uint8: Uint8Array };
 /** Instead of NaN in textures: graphics cards may compare NaN as they like. */
 export const UNKNOWN = -3e38;
 

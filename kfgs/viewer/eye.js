@@ -39,8 +39,8 @@ export class Eye {
   }
 
   /**
-   * The `camera` of a renderer. No angle of view is wider than the photo's: beside an upright photo lies what few photos
-   * show, and a very wide angle distorts. Thus some of the photo's longer side may be cut off, unless `whole`.
+   * The `camera` of a renderer. No angle of view is wider than the photo's: beside an upright photo lies what few
+   * photos show, and a very wide angle distorts. Thus some of the photo's longer side may be cut off, unless `whole`.
    */
   at(width, height) {
     const { lens } = this;

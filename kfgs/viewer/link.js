@@ -28,7 +28,7 @@ export class OfflineLink {
 
   /** The secret in the address of a page that shows a file of splats. */
   async openFile(file) {
-    if (this.call !== callPage) throw new Error(`Only a page of “kfgs view” opens files: run “kfgs view ${file.name}”.`);
+    if (this.call !== callPage) throw new Error(`Only “kfgs view” opens files: run “kfgs view ${file.name}”.`);
     return (await this.call("open", { name: file.name }, file))[0].secret;
   }
 }
@@ -57,7 +57,8 @@ function explain(words, names, needs) {
 /** Answers from Python what the pack does not: session.py at the other end of a page's address or of a notebook's kernel. */
 export class PythonLink extends OfflineLink {
   /**
-   * @param {(name: string, args: object, ...attached: BlobPart[]) => Promise<[object, ArrayBuffer]>} call `callPage` or `callWidget`
+   * @param {(name: string, args: object, ...attached: BlobPart[]) => Promise<[object, ArrayBuffer]>} call `callPage`, or
+   *   what `callWidget` gives
    * @param {{header: object, data: ArrayBuffer}} packed its header says whether Python answers any words
    */
   constructor(call, packed) {

@@ -9,7 +9,7 @@ const EDGES = [0, 1, 2, 3, 4, 5, 6, 7].flatMap((a) => [1, 2, 4].filter((bit) => 
  * @param {{name: string, places: number[][]}[]} marks places in the world: eight corners of a box, in the order of
  *   OrientedBox.corners; two ends of a line; or one place for a label
  * @param {{x: number, width: number, height: string}} pane where it is, CSS pixels
- * @param {function(number[]): number[]|null} project a place in the world -> CSS pixels of the pane; null behind the camera
+ * @param {function(number[]): number[]|null} project a place in the world -> CSS pixels of the pane; null: behind it
  */
 export function marksIn(marks, pane, project) {
   const made = marks.flatMap(({ name, places }) => {

@@ -377,7 +377,8 @@ export class Model extends EventTarget {
       const selected = this.byHand || this.answer?.example ? textOf(this.selected(side)) : null;
       return [side, { count, selected, edits: this.editsOf(side) }];
     });
-    const shown = { hidden: [...this.hidden].sort((a, b) => a - b), side: this.side, picked: this.picked, tape: this.tape };
+    const { side, picked, tape } = this;
+    const shown = { hidden: [...this.hidden].sort((a, b) => a - b), side, picked, tape };
     return { format: "kfgs.view", version: 1, ...asked, ...shown, sides: Object.fromEntries(sides) };
   }
 
@@ -421,7 +422,7 @@ export class Model extends EventTarget {
     this.arrange(saved);
   }
 
-  /** Take over what is no step of undo: hidden classes, the side that is shown, the picked Gaussian, the tape, lambda. */
+  /** Take over what is no step of undo: hidden classes, the side shown, the picked Gaussian, the tape, lambda. */
   arrange({ hidden, side, picked, tape, lambda }) {
     this.hidden = new Set(hidden);
     if (this.sides.includes(side)) this.side = side;

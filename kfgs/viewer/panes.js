@@ -51,7 +51,8 @@ export class Panes {
     this.prepare(this.active);
     const viewport = this.viewport(this.active);
     const drawn = this.model.drawn(this.active.side);
-    return { drawn, ...this.renderer.seen(viewport), at: places.map(([x, y]) => [x * this.ratio - viewport.x, y * this.ratio]) };
+    const at = places.map(([x, y]) => [x * this.ratio - viewport.x, y * this.ratio]);
+    return { drawn, ...this.renderer.seen(viewport), at };
   }
 
   /** The Gaussian at a place (CSS pixels) in the active pane, a selected one first; -1 if there is none. */
@@ -62,7 +63,7 @@ export class Panes {
     return found >= 0 ? found : gaussianAt(cloud, camera, ...place, drawn);
   }
 
-  /** The place of the surface that is seen at a place (CSS pixels) in the active pane, [x, y, z]; null where there is none. */
+  /** Where the surface is that is seen at a place (CSS pixels) in the active pane, [x, y, z]; null: there is none. */
   surface(x, y) {
     const { cloud, camera, drawn, at: [place] } = this.into([x, y]);
     const index = gaussianAt(cloud, camera, ...place, drawn);
@@ -175,8 +176,7 @@ export class Panes {
     const { model, renderer } = this;
     const { answer } = model;
     renderer.side = pane.side;
-    renderer.update(model.clouds[pane.side]);
-    renderer.setSelected(model.byHand ? model.selected(pane.side) : null);
+    renderer.update(model.clouds[pane.side], model.byHand ? model.selected(pane.side) : null);
     const [low, high] = answer ? [answer.low, answer.high] : model.packed.header.clim;
     const hidden = new Uint8Array(model.names.length + 1);
     for (const label of model.hidden) hidden[label < 0 ? model.names.length : label] = 1;

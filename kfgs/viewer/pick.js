@@ -61,7 +61,8 @@ function axesOf(cloud, i, m) {
     [2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)],
   ];
   const scales = cloud.scalesOf(i);
-  return columns.map(([a, b, c], k) => [[0, 4, 8].map((row) => m[row] * a + m[row + 1] * b + m[row + 2] * c), scales[k]]);
+  const turned = ([a, b, c]) => [0, 4, 8].map((row) => m[row] * a + m[row + 1] * b + m[row + 2] * c);
+  return columns.map((column, k) => [turned(column), scales[k]]);
 }
 
 /** The covariance (a, b; b, c) of Gaussian i on the screen, and its opacity there. */

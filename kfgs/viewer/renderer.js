@@ -4,7 +4,8 @@
  */
 import {UNKNOWN, bufferOf, cloudsOf} from "./clouds.js";
 import {bind, fill, frame, program, rectangles, row, sheet, solid, texture} from "./gl.js";
-import {BATCH, COVERED, FINISH, PREPARE, SOLID_FRAGMENT, SOLID_VERTEX, SPLAT_FRAGMENT, SPLAT_VERTEX, WHOLE, WIDTH} from "./shaders.js";
+import {BATCH, COVERED, FINISH, PREPARE, SOLID_FRAGMENT, SOLID_VERTEX} from "./shaders.js";
+import {SPLAT_FRAGMENT, SPLAT_VERTEX, WHOLE, WIDTH} from "./shaders.js";
 import {startSorter} from "./sorter.js";
 
 const MODES = ["color", "labels", "score", "latents"];
@@ -37,9 +38,9 @@ function roundedUp(value) {
 }
 
 /**
- * One canvas, up to two clouds. `side` is the cloud that is drawn next, `camera` the view: {viewmat: 16 numbers, row-major,
- * world to camera (x right, y down, z forward), fx, fy, cx, cy, width, height, near}; pixels of its own picture, which is
- * stretched to the viewport. A camera that changed is another object.
+ * One canvas, up to two clouds. `side` is the cloud that is drawn next, `camera` the view: {viewmat: 16 numbers,
+ * row-major, world to camera (x right, y down, z forward), fx, fy, cx, cy, width, height, near}; pixels of its own
+ * picture, which is stretched to the viewport. A camera that changed is another object.
  */
 export class Renderer {
   /**
@@ -123,23 +124,18 @@ export class Renderer {
     this.#dropTarget(); // it has a picture of them, if there are any
   }
 
-  /** Mark Gaussians of the current side as selected, instead of what the question selects; null takes the marks away. */
-  setSelected(mask) {
-    const state = this.sides[this.side];
-    if (state.selected === mask) return;
-    state.selected = mask;
-    this.#showMarks(state);
-  }
-
-  /** Show a cloud in place of the one of its side: send what is not the same array (see Cloud). */
-  update(cloud) {
+  /**
+   * Show a cloud in place of the one of its side: send what is not the same array (see Cloud). `selected`: a mask of
+   * Gaussians that are marked, instead of what the question selects; or null.
+   */
+  update(cloud, selected) {
     const state = this.sides[cloud.side];
-    const {cloud: before} = state;
-    state.cloud = cloud;
+    const {cloud: before, selected: marked} = state;
+    Object.assign(state, {cloud, selected});
     if (before.source !== cloud.source) { // there are copies, or none any more
       const {side} = this;
       this.#dropSide(state);
-      this.#addSide(cloud);
+      this.#addSide(cloud, selected);
       this.side = side;
       return;
     }
@@ -148,7 +144,7 @@ export class Renderer {
       this.#sendMeans(state);
     }
     if (before.dc !== cloud.dc) this.#showColors(state);
-    if (before.removed !== cloud.removed) this.#showMarks(state);
+    if (before.removed !== cloud.removed || marked !== selected) this.#showMarks(state);
   }
 
   /**
@@ -185,7 +181,7 @@ export class Renderer {
     this.gl.getExtension("WEBGL_lose_context")?.loseContext();
   }
 
-  #addSide(cloud) {
+  #addSide(cloud, selected = null) {
     const {gl} = this;
     const {count, planes} = cloud;
     const rows = Math.ceil(count / WIDTH);
@@ -202,7 +198,7 @@ export class Renderer {
     };
     const prepared = frame(gl, [shape, paint]);
     const state = {
-      cloud, count, textures, rows, shape, paint, prepared, id: ++this.loads, selected: null,
+      cloud, count, textures, rows, shape, paint, prepared, id: ++this.loads, selected,
       length: 0, asked: null, fresh: null, busy: false,
     };
     this.sides[cloud.side] = state;

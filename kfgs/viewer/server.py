@@ -183,10 +183,11 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _name(self) -> str | None:
         """The file asked for; None if the request was refused."""
-        host, origin = self.headers.get("Host", ""), self.headers.get("Origin")
+        host = self.headers.get("Host", "")
+        origin = self.headers.get("Origin", f"//{host}")
         try:
             _, asked, name = urlsplit(self.path).path.split("/", 2)
-            machine, source = urlsplit(f"//{host}").hostname or "", urlsplit(origin or f"//{host}").netloc
+            machine, source = urlsplit(f"//{host}").hostname or "", urlsplit(origin).netloc
         except ValueError:  # too few parts, or brackets that do not match, as in http://[
             asked, name, machine, source = "", "", "", ""
         scenes = list(self.page.scenes.items())

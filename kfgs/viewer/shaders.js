@@ -222,7 +222,7 @@ void main() {
 #endif
 }`;
 
-/** Points and meshes: drawn before the Gaussians, which their depth hides; seen through what the Gaussians leave free. */
+/** Points and meshes: drawn first; their depth hides Gaussians, and what the others leave free shows them. */
 export const SOLID_VERTEX = `${HEAD}
 layout(location = 0) in vec3 place;
 layout(location = 1) in vec3 tone;
@@ -246,7 +246,8 @@ out vec4 picture;
 void main() {
   if (!meshed && length(gl_PointCoord - 0.5) > 0.5) discard;
   vec3 normal = normalize(cross(dFdx(at), dFdy(at)));
-  picture = vec4(meshed ? color * (0.35 + 0.65 * abs(dot(normal, normalize(at)))) : color, 1.0);  // a lamp at the camera
+  float light = meshed ? 0.35 + 0.65 * abs(dot(normal, normalize(at))) : 1.0;  // of a lamp at the camera
+  picture = vec4(color * light, 1.0);
 }`;
 
 /** Marks pixels that are covered completely, so that nothing behind is drawn there. */
