@@ -122,9 +122,8 @@ def test_scores_of_a_splat_may_be_cosines_below_zero_or_missing():
     assert asked.valid.tolist() == [True, True, False, False, False]
     table = made.ask("table").selection
     assert (len(table), made.by) == (0, "the file's classes and scores")
-    positive = SplatMeaning(splat_file(cloud(LINE, LABELS), np.array([0.8, 0.9, 0.5, 0.1, 0.7], np.float32))).ask(
-        "chair"
-    )
+    above = splat_file(cloud(LINE, LABELS), np.array([0.8, 0.9, 0.5, 0.1, 0.7], np.float32))
+    positive = SplatMeaning(above).ask("chair")
     assert (positive.low, positive.high) == (0.0, 1.0)
     assert positive.selection.scores.tolist() == pytest.approx([0.8, 0.9, 0, 0, 0])
 

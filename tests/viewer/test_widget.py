@@ -17,12 +17,6 @@ from kfgs.splat import rasterize
 from kfgs.viewer import Viewer, explore, pack
 
 
-def still_of(state):
-    bundle = Viewer(state).widget._repr_mimebundle_()
-    file = base64.b64decode((bundle[0] if isinstance(bundle, tuple) else bundle)["image/jpeg"])
-    return np.asarray(Image.open(io.BytesIO(file))).astype(int)
-
-
 def test_explore_in_a_notebook_gives_a_viewer(monkeypatch):
     state = cases_explorer.room()
     viewer = explore(
@@ -48,7 +42,9 @@ def test_explore_in_a_notebook_gives_a_viewer(monkeypatch):
 def test_a_picture_stands_in_where_widgets_cannot_run(show):
     state = cases_explorer.room()
     state.set_show(show)
-    picture = still_of(state)
+    bundle = Viewer(state).widget._repr_mimebundle_()
+    file = base64.b64decode((bundle[0] if isinstance(bundle, tuple) else bundle)["image/jpeg"])
+    picture = np.asarray(Image.open(io.BytesIO(file))).astype(int)
     assert picture.shape[:2] == (state.cameras[0].height, state.cameras[0].width)
     cloud = state.cloud("color")
     if show == "labels":
