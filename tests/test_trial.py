@@ -129,7 +129,16 @@ def test_10_a_film(field, splat, tmp_path):
     cameras = orbit_cameras(splat.means, Orbit(frames=2, size=(48, 64)))
     for name, shown in {"splat": splat, "field": field, "both": {"a": field, "b": splat}}.items():
         assert viz.save_animation(tmp_path / f"{name}.gif", shown, cameras, legend=field).is_file()
-    assert viz.save_animation(tmp_path / "around.gif", splat).is_file()
+    seen = []
+
+    def look(camera):
+        seen.append(camera)
+        raise RuntimeError("one is enough")
+
+    for shown in (field, splat):  # without cameras once around; walls of a room that are in front are cut away
+        call = lambda shown=shown: viz.save_animation(tmp_path / "a.gif", {"a": shown, "b": look})  # noqa: E731
+        refused(call, "one is enough", error=RuntimeError)
+    assert seen[0].near / seen[0].center.norm() > 0.75 > seen[1].near / seen[1].center.norm()
     for given in (cameras, None):
         call = lambda given=given: viz.save_animation(tmp_path / "a.gif", "run", given)  # noqa: E731
         refused(call, "expected a SemanticField or Gaussians", "SemanticField.load", error=TypeError)

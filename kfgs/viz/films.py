@@ -18,7 +18,7 @@ from torch import Tensor
 
 from .._check import as_array, check_range, check_shapes
 from .._files import atomic_path
-from ..cameras import Camera, orbit_cameras
+from ..cameras import Camera, Orbit, orbit_cameras
 from ..gaussians import Gaussians
 from ..labels import Part
 from ..labels.color import parse_color
@@ -29,6 +29,7 @@ from ..splat import rasterize
 from .colors import Array, ColorBy, FeatureColors, cloud_colors
 from .linked import upwards
 from .pictures import as_bytes, check_suffix, draw_legend, picture_grid, picture_sheet, resize_photo, save_picture
+from .transfer import enclosing
 
 if TYPE_CHECKING:
     from ..fields import SemanticField
@@ -136,7 +137,7 @@ def save_animation(
         path: a name that ends in .gif or .mp4. The file appears whole or not at all.
         shows: a cloud, a field, a function camera -> picture (`show_cloud`), or several of these by title, side by side.
         cameras: one per frame (`kfgs.cameras.orbit_cameras`, `path_cameras`); all frames have the size of the first, in which
-            those of other shapes are seen whole. None: once around the first cloud.
+            those of other shapes are seen whole. None: once around the first cloud; of a room, what is in front is cut away.
         fps: frames per second; at most 50 in a GIF, because browsers slow down films with shorter frames.
         legend: the labelled cloud, or the field, whose classes are listed below every frame; None: no legend.
         progress: called after each frame with (done, all).
@@ -144,12 +145,13 @@ def save_animation(
     named = shows if isinstance(shows, Mapping) else {"": shows}
     first: Any = next(iter(named.values()), print)
     if cameras is None and not callable(first):
-        cloud = as_cloud(first, "shows")
-        cameras = orbit_cameras(cloud.means, up=upwards(getattr(first, "cameras", ())), origin=cloud.origin)
+        cloud, own = as_cloud(first, "shows"), getattr(first, "cameras", ())
+        up = upwards(own)
+        orbit = Orbit(zoom=1.3, cut=0.6) if enclosing(cloud, own, np.asarray(up)).any() else Orbit()  # walls hide rooms
+        cameras = orbit_cameras(cloud.means, orbit, up=up, origin=cloud.origin)
     if not named or not cameras:
-        raise ValueError(
-            "shows, cameras: expected at least one of each, got none; kfgs.cameras.orbit_cameras makes some"
-        )
+        advice = "kfgs.cameras.orbit_cameras makes some"
+        raise ValueError(f"shows, cameras: expected at least one of each, got none; {advice}")
     target = check_target(path, fps)
     drawn = {title: show if callable(show) else show_cloud(show) for title, show in named.items()}
     labelled = None if legend is None else as_cloud(legend, "legend", labelled=True)
@@ -194,8 +196,8 @@ def _write_gif(path: Path, frames: Iterator[Array], fps: float) -> None:
 def _write_mp4(path: Path, frames: Iterator[Array], fps: float) -> None:
     writer = None
     for frame in frames:
-        height, width = frame.shape[:2]
-        paper = np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), constant_values=255)  # H.264 needs even sizes
+        odd = [(0, side % 2) for side in frame.shape[:2]]  # H.264 needs even sizes
+        paper = np.pad(frame, [*odd, (0, 0)], constant_values=255)
         if writer is None:
             options = {"fps": fps, "codec": "libx264", "quality": 8, "macro_block_size": 2, "ffmpeg_log_level": "error"}
             writer = _ffmpeg().write_frames(str(path), paper.shape[1::-1], **options)
@@ -210,6 +212,5 @@ def _ffmpeg() -> Any:
         return importlib.import_module("imageio_ffmpeg")
     except ImportError as error:
         install = "pip install imageio-ffmpeg (or write a .gif, which needs nothing)"
-        raise ImportError(
-            f"path: expected imageio-ffmpeg to write .mp4, but it is not installed; run: {install}"
-        ) from error
+        wanted = "imageio-ffmpeg to write .mp4, but it is not installed"
+        raise ImportError(f"path: expected {wanted}; run: {install}") from error

@@ -168,8 +168,7 @@ def camera_of(plotter: pv.Plotter, renderer: Any, near: float = NEAR) -> Camera:
     seen, drawn = view.GetViewTransformMatrix(), view.GetProjectionTransformMatrix(width / height, -1.0, 1.0)
     E, P = (np.array([[matrix.GetElement(i, j) for j in range(4)] for i in range(4)]) for matrix in (seen, drawn))
     E[1:3] *= -1  # VTK's y points up and z backward
-    K = np.array([[P[0, 0], 0, 1 - P[0, 2]], [0, P[1, 1], 1 + P[1, 2]], [0, 0, 1]])
-    K[:2] *= np.array([[width / 2], [height / 2]])
+    K = np.diag([width / 2, height / 2, 1.0]) @ [[P[0, 0], 0, 1 - P[0, 2]], [0, P[1, 1], 1 + P[1, 2]], [0, 0, 1]]
     return Camera(torch.from_numpy(E), torch.from_numpy(K), width, height, near=near, origin=origin_of(plotter, ORIGIN))
 
 
