@@ -62,9 +62,9 @@ def add_cloud(
         gaussians: what to draw: a cloud, or a field with its classes.
         color_by: `label` or `class` (the palette, by the cloud's class names), the name of one class (the others are grey),
             `score` (of the labels), `rgb` (`sh` without its dependence on the view), `view` (`sh` as the camera sees it;
-            style `gaussians` only), `opacity`, `feature`; a `Selection` (its scores); or one value for each Gaussian:
-            integers [N] are numbers of colours, floats [N] scores (not finite: grey), [N, 3] colours. None: labels if there
-            are any, else rgb, feature, opacity.
+            style `gaussians` only), `opacity`, `feature`; a `Selection` or a rule (its scores); or one value for each Gaussian:
+            integers [N] are numbers of colours, floats or a mask [N] scores (not finite: grey), [N, 3] colours. None: labels if
+            there are any, else rgb, feature, opacity.
         style: `points` is quick; `gaussians` is VTK's EWA splatting, adjusted to kfgs's rasteriser (points in a page that
             pyvista exports); `ellipsoids` are closed surfaces of one standard deviation, for at most 100,000 Gaussians; those up
             to an opacity of 0.5 are left out.
