@@ -70,6 +70,7 @@ class Camera:
     fy = property(lambda self: float(self.K[1, 1]), doc="The vertical focal length, pixels.")
     cx = property(lambda self: float(self.K[0, 2]), doc="The principal point, pixels from the left edge.")
     cy = property(lambda self: float(self.K[1, 2]), doc="The principal point, pixels from the upper edge.")
+    cameras = property(lambda self: (self,), doc="The camera alone, so that it can stand for a list of cameras.")
 
     def __post_init__(self) -> None:
         for name in ("viewmat", "K"):  # integers would truncate the points
@@ -208,8 +209,7 @@ def exact_rotation(name: str, matrix: Tensor) -> Tensor:  # [3, 3] -> [3, 3] flo
 
 def unit_vector(name: str, vector: Tensor | Sequence[float]) -> Tensor:  # [3] float64
     """The direction of a vector; errors name the argument `name`."""
-    values = as_tensor(name, vector).detach().double().cpu()
-    check_shapes((name, values, "3"))
+    check_shapes((name, values := as_tensor(name, vector).detach().double().cpu(), "3"))
     length = float(values.norm())
     if not 0 < length < math.inf:
         raise ValueError(f"{name}: expected a vector with a direction, got {values.tolist()}; for instance (0, 0, 1)")

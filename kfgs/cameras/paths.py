@@ -47,6 +47,7 @@ def path_cameras(
 
     check_whole("frames", frames, 2)
     check_whole("every", every, 1)
+    cameras = getattr(cameras, "cameras", cameras)
     cameras = [camera.with_origin(cameras[0].origin) for camera in cameras]
     keys = [*cameras[::every], *([cameras[-1]] if cameras and (len(cameras) - 1) % every else [])]
     if len(keys) > 1:
@@ -172,7 +173,7 @@ def estimate_up(cameras: Sequence[Camera]) -> Tensor:  # [3] float64, unit
     edges. If all cameras look in one direction, up is the mean direction from the lower to the upper edges. A ValueError if there
     are no cameras, or their upper edges cancel.
     """
-    if not cameras:
+    if not (cameras := getattr(cameras, "cameras", cameras)):
         raise ValueError("cameras: expected at least one camera, got none; give up as a vector instead")
     R = torch.stack([camera.viewmat[:3, :3].detach().double().cpu() for camera in cameras])
     right, mean_up = R[:, 0], -R[:, 1].mean(0)
@@ -209,9 +210,8 @@ def orbit_cameras(
     orbit = orbit or Orbit()
     cloud = as_tensor("points", points).detach().double().cpu()
     check_finite("points", cloud)
-    bounds = robust_bounds(cloud, coverage=0.96, margin=0.0)
-    center, radius = (bounds.low + bounds.high) / 2, float((bounds.high - bounds.low).norm()) / 2
-    radius = radius or 1.0  # all in one place
+    low, high, _ = robust_bounds(cloud, coverage=0.96, margin=0.0)
+    center, radius = (low + high) / 2, float((high - low).norm()) / 2 or 1.0  # 1 if all are in one place
     height, width = orbit.size
     half = min(height, width) / height * tan(radians(orbit.fov_degrees) / 2)  # tangent of half the narrower angle
     distance = radius * hypot(1, half) / half / orbit.zoom  # the sphere touches the nearer edges

@@ -168,7 +168,7 @@ def to_kornia(cameras: Sequence[Camera]) -> PinholeCamera:
         >>> to_kornia([camera]).project(torch.tensor([[[0.2, 0.1, 2.0]]]))
         tensor([[[42., 29.]]])
     """
-    if not len(cameras):
+    if not (cameras := getattr(cameras, "cameras", cameras)):
         raise ValueError("cameras: expected at least one Camera, got none; select a view that the scene has")
     cameras = [camera.with_origin(cameras[0].origin) for camera in cameras]
     for camera in cameras:

@@ -88,7 +88,7 @@ def fit_field(
         raise ValueError(
             f"gaussians: expected some with features [N, d] or sh [N, K, 3], got {gaussians!r}; gaussians_from_points makes them"
         )
-    if not cameras or len(cameras) != len(targets):
+    if not (cameras := getattr(cameras, "cameras", cameras)) or len(cameras) != len(targets):
         got = f"{len(targets)}; pass the views that have maps"
         raise ValueError(f"targets: expected one map per camera ({len(cameras)}, at least one), got {got}")
     if gaussians.origin == ORIGIN:

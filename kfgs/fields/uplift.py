@@ -114,8 +114,8 @@ def uplift_maps(
         To continue by training, start `fit_field` with `field.gaussians` and the maps
         `field.decoder.encode(unit features)`.
     """
-    config, progress, count = config or UpliftConfig(), as_bar(progress), len(cameras)
-    if count == 0 or count != len(maps):
+    config, progress, cameras = config or UpliftConfig(), as_bar(progress), getattr(cameras, "cameras", cameras)
+    if (count := len(cameras)) == 0 or count != len(maps):
         raise ValueError(
             f"maps: expected one per camera ({count}, at least one), got {len(maps)}; pass the views that have maps"
         )
@@ -223,7 +223,7 @@ def fuse_views(field: SemanticField, cameras: Sequence[Camera]) -> SemanticField
     The result is the field with these `cameras` and the averages as `fused`. A field with a `Linear` decoder is fused
     already, and gets the cameras alone. Without a codebook, rendered features are averaged without quantising.
     """
-    if not cameras:
+    if not (cameras := getattr(cameras, "cameras", cameras)):
         raise ValueError("cameras: expected at least one, got none; pass those that the field was trained with")
     decoder, gaussians = field.decoder, field.gaussians
     if isinstance(decoder, Linear):

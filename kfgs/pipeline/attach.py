@@ -107,7 +107,7 @@ def attach(
     if not hasattr(field, "label"):
         raise TypeError(f"field: expected a SemanticField, got {type(field).__name__}; SemanticField.load opens one")
     splats = read_splats(splats) if isinstance(splats, str | Path) else splats
-    cameras = list(cameras or field.cameras)
+    cameras = list(getattr(cameras, "cameras", cameras) or field.cameras)
     by = by or ("views" if cameras else "distance")
     check_choice("by", by, ("distance", "views"))
     if distance is not None:
@@ -164,7 +164,7 @@ def _common_frame(
     if isinstance(frame, Similarity):
         return frame, None, "the similarity between the frames was given"
     if frame is not None:
-        alignment = align_by_cameras(cameras, frame)
+        alignment = align_by_cameras(cameras, getattr(frame, "cameras", frame))
         return alignment.similarity, alignment, f"aligned by {alignment.summary}"
     origin, solid = field.gaussians.origin, []
     for cloud in (field.gaussians, splats):

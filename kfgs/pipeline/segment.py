@@ -102,6 +102,7 @@ def segment_cameras(
     Returns:
         The label map [H, W] of each camera by its name, without a suffix such as .png.
     """
+    cameras = getattr(cameras, "cameras", cameras)
     names = [file_stem(camera.name or "") for camera in cameras]
     if len(set(names)) != len(names) or not all(map(is_inside, names)):
         raise ValueError(
@@ -118,8 +119,7 @@ def segment_cameras(
     unused = np.zeros((VOID - len(classes), 3), np.uint8)
     colors = np.vstack([palette(np.arange(len(classes)), classes.names), unused, [UNLABELLED]]).astype(np.uint8)
     labels = {}
-    pairs = zip(names, cameras, strict=True)
-    for name, camera in tqdm(pairs, desc="segment", total=len(names), unit="view", disable=not progress):
+    for name, camera in tqdm([*zip(names, cameras, strict=True)], desc="segment", unit="view", disable=not progress):
         labels[name] = field.segment(camera, classes)
         save_label_map(out / "predicted" / f"{name}.png", labels[name])
         save_label_map(out / "colored" / f"{name}.png", labels[name], colors)

@@ -86,8 +86,8 @@ def explore(
     if where == "notebook":
         require_widget()
     meaning: Meaning
+    cameras = getattr(cameras or source, "cameras", cameras)
     if isinstance(source, SemanticField):
-        cameras = cameras or source.cameras
         meaning = FieldMeaning(source, classes, cameras=cameras, embed=embed)
     else:
         meaning = SplatMeaning(as_cloud(source, "source"))

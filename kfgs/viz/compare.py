@@ -29,6 +29,7 @@ def views_of_change(
     others. `between` is the scene after each of several edits: then each edit gets its best view first, unless a chosen view
     shows it half as well, or it is undone later.
     """
+    cameras = getattr(cameras, "cameras", cameras)
     small = [camera.resized(max(1, round(PREVIEW * camera.height / camera.width)), PREVIEW) for camera in cameras]
     drawn = [[render_color(state, camera) for camera in small] for state in (before, *between, after)]
     total = _shares(drawn[0], drawn[-1])
@@ -53,8 +54,7 @@ def _shares(before: Sequence[Tensor], after: Sequence[Tensor]) -> list[float]:  
 
 def _ranked(shares: Sequence[float]) -> list[int]:
     """The viewpoints in which something changes, the best first."""
-    order = sorted(range(len(shares)), key=lambda i: (shares[i] > MOST, -shares[i]))
-    return [i for i in order if shares[i] > 0]
+    return sorted((i for i, share in enumerate(shares) if share > 0), key=lambda i: (shares[i] > MOST, -shares[i]))
 
 
 def write_comparison(path: Path, before: Gaussians, after: Gaussians, cameras: Sequence[Camera]) -> Path:

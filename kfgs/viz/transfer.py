@@ -66,7 +66,7 @@ def show_transfer(
     Raises:
         ValueError: if a cloud is empty, has no labels or no colours, or the distance is not positive.
     """
-    views: Sequence[Camera] = cameras or getattr(field, "cameras", None) or ()
+    views: Sequence[Camera] = getattr(cameras or field, "cameras", cameras) or ()
     semantic, splat = as_cloud(field, "field", labelled=True), as_cloud(splat, "splat")
     if not (as_array(semantic.labels) >= 0).any():
         raise ValueError(f"field: expected Gaussians with a class, got none in {semantic!r}; choose other classes")

@@ -82,14 +82,8 @@ def test_up_of_nothing_or_of_pictures_upside_down_is_refused():
     refused(lambda: estimate_up(views), "cameras:", "upright", "got 2")
 
 
-@pytest.mark.parametrize(
-    ("points", "up", "message"),
-    [
-        (torch.zeros(0, 3), TILTED, ("points:", "got none")),
-        (torch.full((4, 3), math.nan), TILTED, ("points:", "NaN")),
-        (torch.zeros(4, 3), (0.0, 0.0, 0.0), ("up:", "got [0.0, 0.0, 0.0]")),
-        (torch.zeros(4, 3), (0.0, 1.0), ("up:", "[3]", "got (2,)")),
-    ],
-)
-def test_what_cannot_be_gone_round_is_refused(points, up, message):
-    refused(lambda: orbit_cameras(points, up=up), *message)
+def test_what_cannot_be_gone_round_is_refused():
+    refused(lambda: orbit_cameras(torch.zeros(0, 3)), "points:", "got none")
+    refused(lambda: orbit_cameras(torch.full((4, 3), math.nan)), "points:", "NaN")
+    refused(lambda: orbit_cameras(torch.zeros(4, 3), up=(0.0, 0.0, 0.0)), "up:", "got [0.0, 0.0, 0.0]")
+    refused(lambda: orbit_cameras(torch.zeros(4, 3), up=(0.0, 1.0)), "up:", "[3]", "got (2,)")
