@@ -9,9 +9,7 @@ from ._interrupts import end_at_once
 
 def run() -> int:
     """Run the command of this process; return the exit code."""
-    while (
-        number := os.open(os.devnull, os.O_RDWR)
-    ) <= 2:  # closed streams (`2>&-`): else a file would get their numbers
+    while (number := os.open(os.devnull, os.O_RDWR)) <= 2:  # closed streams (`2>&-`): else a file gets their numbers
         os.set_inheritable(number, True)
     os.close(number)
     sys.stdout = sys.stdout or open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115 (it lives as long as the process)

@@ -87,6 +87,8 @@ def as_tensor(name: str, value: Any, *, floating: bool = False) -> Tensor:
                 array = np.asarray(value)
         if array.dtype.kind not in "fiub":
             advice = "pass numbers, in rows of equal length" if is_list else _instead(value)
+            if isinstance(value, list | tuple) and any(isinstance(entry, str) for entry in value):
+                advice = "pass numbers, not names; field.query(name) takes one name at a time"
             raise TypeError(f"{name}: expected a tensor, got {type(value).__name__}; {advice}")
         shared = array.flags.writeable and array.flags.aligned and array.dtype.isnative
         if not shared or any(stride < 0 for stride in array.strides):  # torch would refuse it, or warn

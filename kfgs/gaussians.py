@@ -115,8 +115,7 @@ class Gaussians:
             IndexError: if there is no such Gaussian.
         """
         index = as_rows("which", which, self).to(self.means.device)
-        rows = index.cpu().numpy() if self.extra else None
-        extra = {name: np.asarray(column)[rows] for name, column in self.extra.items()}
+        extra = {name: np.asarray(column)[index.cpu().numpy()] for name, column in self.extra.items()}
         return self.replace(**{name: value[index] for name, value in self.tensors().items()}, extra=extra)
 
     __getitem__ = select
@@ -143,13 +142,14 @@ class Gaussians:
         return {name: as_array(value) for name, value in self.tensors().items()}
 
     @staticmethod
-    def cat(parts: Sequence[Gaussians]) -> Gaussians:
-        """Concatenate clouds that carry the same tensors and columns; the edit `Insert` joins others.
+    def cat(parts: Sequence[Any]) -> Gaussians:
+        """Concatenate clouds, or fields with their classes, of the same tensors and columns; the edit `Insert` joins others.
 
         A ValueError if there is nothing to join, or one cloud carries what another lacks.
         """
         if not parts:
             raise ValueError("parts: expected at least one Gaussians, got none")
+        parts = [part.label() if hasattr(part, "label") else part for part in parts]
         first, names = parts[0], list(parts[0].tensors())
         for i, part in enumerate(parts):
             for what, expected, got in (

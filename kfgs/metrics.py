@@ -110,9 +110,7 @@ class ConfusionMatrix:
             if labels.is_floating_point() or labels.is_complex() or labels.dtype == torch.bool:
                 raise TypeError(f"{name}: expected integer labels, got {labels.dtype}; convert with .long()")
         pred, target = pred.flatten().long(), target.flatten().long()
-        known = torch.ones_like(target, dtype=torch.bool)
-        for label in self.ignore:
-            known &= target != label
+        known = ~torch.isin(target, target.new_tensor([*self.ignore]))
         pred, target = pred[known], target[known]
         pred = pred.where(pred != -1, self.classes)
         self._check("pred", pred, self.classes + 1, "pass class indices, or -1 for none")

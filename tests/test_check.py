@@ -108,7 +108,7 @@ class Maps(Sequence):
     [
         ("chair", ("str", "'chair'", "embedding")),
         ([[1.0, 2.0], [3.0]], ("list", "rows of equal length")),
-        (["chair"], ("list", "pass numbers")),
+        (["chair"], ("list", "pass numbers", "field.query(name)")),
         ([torch.ones(2, requires_grad=True)] * 2, ("list", "pass numbers")),
         ({"a": 1.0}, ("dict", "torch.as_tensor")),
         (SimpleNamespace(codewords=1), ("SimpleNamespace", ".codewords")),

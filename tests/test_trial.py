@@ -71,6 +71,7 @@ def test_4_boxes_of_chairs_as_json(field, tmp_path):
     assert parts[0].count == ruled[0].count
     columns = {name: column for name, column in field.label().to_numpy().items() if column.ndim == 1}  # for pandas
     assert set(columns) == {"opacities", "labels", "scores"}
+    refused(lambda: field.query(["chair", "wall"]), "embedding:", "got list", "field.query(name)", error=TypeError)
     assert abs(asked[0].count - parts[0].count) <= 5
 
 
@@ -92,6 +93,8 @@ def test_7_scores_of_my_own_predictions(field):
     truth = {"a": np.array([[0, 1], [1, -1]]), "b": torch.tensor([[2, 2]])}
     for predicted in (truth, truth.get, {name: torch.as_tensor(labels) for name, labels in truth.items()}):
         assert evaluate_segmentation(predicted, truth, field.classes).miou.value == 1
+    own = {stem: field.segment(stem) for stem in ("view_000", "view_002")}
+    assert evaluate_segmentation(field, own, field.classes).miou.value == 1
     refused(lambda: evaluate_segmentation({}, truth, field.classes), "predict('a'):", "got NoneType", error=TypeError)
 
 
@@ -99,6 +102,7 @@ def test_8_several_splats(field, splat, tmp_path):
     for k in range(2):
         kfgs.write_splats(kfgs.attach(field, splat).gaussians, tmp_path / f"{k}.ply")
         assert kfgs.read_splats(tmp_path / f"{k}.ply").names == field.classes.names
+    refused(lambda: kfgs.SemanticField.load(tmp_path / "0.ply"), "0.ply:", "a field", "read_splats opens a splat")
 
 
 def test_9_a_label_map_with_a_legend(scene, field):
@@ -158,7 +162,7 @@ def test_12_gradients_through_a_frozen_field(field):
 def test_13_two_fields_as_one_cloud(field):
     both = join_fields([field, field])
     assert len(both) == 2 * len(field)
-    assert len(kfgs.Gaussians.cat([field.label(), field.label()])) == len(both)
+    assert kfgs.Gaussians.cat([field, field]).labels.equal(torch.cat([field.label().labels] * 2))
 
 
 def test_14_crops(field, splat):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -64,7 +64,7 @@ def check_truth(target: Tensor, classes: int, name: str) -> None:  # target: [H,
 
 
 def evaluate_segmentation(
-    predict: Callable[[str], Tensor] | Mapping[str, Tensor],  # stem -> labels [h, w]
+    predict: Any,  # stem -> labels [h, w]: a mapping, a function or a field
     truth: Mapping[str, Path | Tensor],  # stem -> label picture, or its labels [H, W] with -1 = void
     names: Any,
 ) -> SegmentationReport:
@@ -72,6 +72,7 @@ def evaluate_segmentation(
 
     Args:
         predict: the label map of each view by its stem (mapping or function), at any size; -1 is wrong where truth is known.
+            A field segments its own views; for others, `lambda stem: field.segment(scene[stem])`.
         truth: one label picture, or array, per view.
         names: class names, or what has them (a label set); a label is an index into them.
 
@@ -81,12 +82,13 @@ def evaluate_segmentation(
     names = tuple(getattr(names, "names", names))
     if not truth:
         raise ValueError("truth: expected at least one label picture, got none; is the folder of labels right?")
+    answer = getattr(predict, "get" if isinstance(predict, Mapping) else "segment", predict)
     pooled = ConfusionMatrix(len(names))
     for stem, given in truth.items():
         place = str(given) if isinstance(given, str | Path) else f"truth[{stem!r}]"
         target = load_label_map(given) if isinstance(given, str | Path) else as_tensor(place, given)
         check_truth(target, len(names), place)
-        labels = as_tensor(f"predict({stem!r})", predict.get(stem) if isinstance(predict, Mapping) else predict(stem))
+        labels = as_tensor(f"predict({stem!r})", answer(stem))
         if labels.shape != target.shape:
             labels = resize_labels(labels, (int(target.shape[0]), int(target.shape[1])))
         pooled.update(labels, target)

@@ -31,7 +31,7 @@ from .packing import Precision, pack, unpack
 SUFFIX, NAME = ".kfgs", "field.kfgs"
 KIND, VERSION = "semantic field", "1"
 DESCRIPTION, WORDS = "description", 8 << 20  # the tensor with the JSON, and its most bytes
-WHAT, AGAIN = "a field of kfgs", "copy it again, or fit the field again"
+WHAT, AGAIN, SPLAT = "a field of kfgs", "copy it again, or fit the field again", "read_splats opens a splat"
 SCENE_FILES = ("classes.json", "text.npy"), ("classes.json", "text.safetensors"), ("text.safetensors",)
 """Files of a scene folder that make a label set; the first group of which all exist is used."""
 
@@ -130,7 +130,7 @@ def _field_file(path: str | Path) -> Path:
 
 def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """The tensors of a field's file, and its description."""
-    tensors, _ = read_safetensors(path, WHAT, AGAIN, kfgs=(KIND, VERSION))
+    tensors, _ = read_safetensors(path, WHAT, AGAIN if path.suffix == SUFFIX else SPLAT, kfgs=(KIND, VERSION))
     with reading(path, WHAT, AGAIN):
         packed = tensors.pop(DESCRIPTION).numpy().tobytes()
         if zstandard.get_frame_parameters(packed).content_size > WORDS:

@@ -143,7 +143,7 @@ def recolor_cloud(
     colors: Array,  # [N, 3] uint8
     opacities: Array | None = None,  # [N] in [0, 1]
 ) -> None:
-    """Change the colours, and with style `gaussians` the opacities, of a cloud that `add_cloud` drew, from the next frame on."""
+    """Recolour a cloud that `add_cloud` drew, with style `gaussians` also its opacities, from the next `plotter.render()` on."""
     mesh = actor.mapper.dataset
     index = np.asarray(mesh["index"])
     if opacities is not None:

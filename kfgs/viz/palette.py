@@ -83,7 +83,8 @@ def palette(
         raise ValueError(
             f"names: expected a name for every label up to {values.max()}, got {len(names)} names; pass all class names"
         )
-    slots = values if names is None or not len(names) else np.array(name_slots(names))[values]
+    numbered = names is None or all(name == f"class {k}" for k, name in enumerate(names))
+    slots = values if numbered else np.array(name_slots(names))[values]
     return np.where((values < 0)[..., None], np.array(UNLABELLED, dtype=np.uint8), PALETTE[slots % len(PALETTE)])
 
 
@@ -96,8 +97,7 @@ def name_slots(names: Sequence[str]) -> list[int]:
     """
     words = [" ".join(name.lower().replace("_", " ").replace("-", " ").split()) for name in names]
     slots: dict[int, int] = {}
-    digits = {i: word.removeprefix("class ") for i, word in enumerate(words)}
-    numbers = {i: int(number) % TIERS[-1] for i, number in digits.items() if number.isdecimal()}
+    numbers = {i: int(n) % TIERS[-1] for i, word in enumerate(words) if (n := word.removeprefix("class ")).isdecimal()}
     named = sorted(set(range(len(names))) - set(numbers), key=lambda i: (_RANKS.get(words[i], 0), words[i], i))
     for i in named:
         if (home := _HOMES.get(words[i])) is not None and home not in slots.values():

@@ -7,25 +7,24 @@ from messages import refused
 
 from kfgs.cameras import Camera, Orbit, estimate_up, orbit_cameras, project_points
 
-ORIGIN = torch.zeros(3, dtype=torch.float64)
+ORIGIN, MIDDLE = torch.tensor([[0.0, 0.0, 0.0], [1.0, 2.0, 3.0]], dtype=torch.float64)
 TILTED = torch.tensor([1.0, -2.0, 2.0], dtype=torch.float64) / 3
 
 
 def cloud(n=4000, seed=0):
     """A box of 2 x 4 x 6 about (1, 2, 3), its corners included."""
     points = torch.rand(n, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) * 2 - 1
-    return points * torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64) + torch.tensor([1.0, 2.0, 3.0])
+    return points * torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64) + MIDDLE
 
 
 @pytest.mark.parametrize("up", [(0.0, 0.0, 1.0), TILTED])
 def test_cameras_go_round_the_middle_at_one_height_with_the_world_upright(up):
-    middle = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
     zenith = torch.as_tensor(up, dtype=torch.float64)
     cameras = orbit_cameras(cloud(), Orbit(frames=8, elevation_degrees=30), up=up)
     centers = torch.stack([camera.center for camera in cameras])
-    target = centers + torch.stack([one.viewmat[2, :3] for one in cameras]) * (centers - middle).norm(dim=1)[:, None]
+    target = centers + torch.stack([one.viewmat[2, :3] for one in cameras]) * (centers - MIDDLE).norm(dim=1)[:, None]
     np.testing.assert_allclose(target, target[:1].expand(8, 3), atol=0.02)  # the box is known from samples
-    np.testing.assert_allclose(target[0], middle, atol=0.1)
+    np.testing.assert_allclose(target[0], MIDDLE, atol=0.1)
     rays = centers - target[0]
     np.testing.assert_allclose(rays.norm(dim=1), float(rays[0].norm()), rtol=2e-3)
     np.testing.assert_allclose(rays @ zenith / rays.norm(dim=1), math.sin(math.radians(30)), atol=2e-3)
@@ -42,18 +41,17 @@ def test_cameras_go_round_the_middle_at_one_height_with_the_world_upright(up):
 def test_the_sphere_about_the_box_touches_the_picture_and_zoom_halves_the_distance():
     orbit = Orbit(frames=1, size=(100, 160), elevation_degrees=0)
     camera = orbit_cameras(cloud(), orbit)[0]
-    middle = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
-    radius, distance = math.sqrt(1 + 4 + 9) * 0.96, float((camera.center - middle).norm())
+    radius, distance = math.sqrt(1 + 4 + 9) * 0.96, float((camera.center - MIDDLE).norm())
     # a ray that touches the sphere leaves at asin(radius / distance)
     edge = float(camera.K[1, 1]) * math.tan(math.asin(radius / distance))
     assert edge == pytest.approx(50, rel=0.02)
     closer = orbit_cameras(cloud(), Orbit(frames=1, size=(100, 160), elevation_degrees=0, zoom=2))[0]
-    assert float((closer.center - middle).norm()) == pytest.approx(distance / 2, rel=0.02)
+    assert float((closer.center - MIDDLE).norm()) == pytest.approx(distance / 2, rel=0.02)
 
 
 def test_a_cut_opens_the_front():
     cut, whole = (orbit_cameras(cloud(), Orbit(frames=1, cut=share))[0] for share in (0.5, 0.0))
-    distance = float((whole.center - torch.tensor([1.0, 2.0, 3.0])).norm())
+    distance = float((whole.center - MIDDLE).norm())
     radius = distance - whole.near
     assert cut.near == pytest.approx(whole.near + radius / 2, rel=1e-3)  # middle known to 1 %
     assert radius == pytest.approx(math.sqrt(14) * 0.96, rel=0.02)

@@ -62,6 +62,8 @@ def test_a_class_without_a_name_takes_no_colour_from_one_with_a_name():
     assert all(slots[k] == k for k in range(3, 40) if k not in slots[:3])
     assert len(set(slots)) == 40
     assert name_slots([*named, "class 3", "class 4"]) == slots[:5]  # a crop has the colours of its cloud
+    numbered = palette(np.array([999]), [f"class {k}" for k in range(1000)])
+    assert numbered.tolist() == palette(np.array([999])).tolist() == [PALETTE[name_slots(["class 999"])[0]].tolist()]
     assert name_slots(["class 1000", str(10**30)])[0] == 1000 % 256
 
 
