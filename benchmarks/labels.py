@@ -25,9 +25,10 @@ from torch import Tensor
 
 from kfgs import Camera
 from kfgs.fields import Autoencoded, Linear, SemanticField
-from kfgs.labels import classify, relevancy
+from kfgs.labels import classify
 from kfgs.labels.classify import pixel_codewords
 from kfgs.labels.scores import LOGIT_SCALE
+from kfgs.labels.selection import select_by_similarity
 from kfgs.quant import Autoencoder, Codebook
 from kfgs.scenes import load_scene
 from kfgs.splat import bin_tiles, project, rasterize, rasterize_labels
@@ -235,7 +236,7 @@ def compared(field: SemanticField, camera: Camera, rows: Tensor) -> Tensor:
     unit = torch.nn.functional.normalize(rows[:5], dim=1)
     pixels = field.render(camera).map.flatten(0, 1)
     cosines = torch.cat([field.decoder.cosines(part, unit) for part in pixels.split(CHUNK)])
-    return relevancy(cosines[:, 0], cosines[:, 1:]).view(camera.size)
+    return select_by_similarity(cosines[:, 0], cosines[:, 1:]).scores.view(camera.size)
 
 
 def decoded(field: SemanticField, latents: Tensor, table: Tensor, covered: Tensor) -> Tensor:

@@ -16,8 +16,7 @@ from kfgs.cli import main
 from kfgs.fields import SemanticField, fuse_views
 from kfgs.formats import read_splats, write_splats
 from kfgs.formats.ply import read_ply
-from kfgs.labels import connected_parts, load_label_set
-from kfgs.labels.components import part_distance
+from kfgs.labels import connected_parts, load_label_set, number_instances
 from kfgs.scenes import load_scene
 from kfgs.splat import rasterize
 
@@ -218,18 +217,17 @@ def test_all_photographs_can_be_used_and_none_is_left_to_score(room, splat, tmp_
 def test_parts_that_are_not_listed_are_counted(desk, capsys):
     field = SemanticField.load(desk / "run")
     selection = field.query("chair")
-    listed, distance = (
-        connected_parts(field.gaussians, selection),
-        part_distance(field.gaussians.means, selection.mask),
-    )
+    counts = lambda lines: [int(re.search(r"Part\((\d+) ", line)[1]) for line in lines]  # noqa: E731
     assert main(["select", "chair", str(desk / "run")]) == 0
-    *parts, joined, note = capsys.readouterr().out.splitlines()[1:]
-    assert joined == f"  parts are joined within {distance:.3g}; --distance changes it"
-    assert [int(re.search(r"Part\((\d+) ", line)[1]) for line in parts] == [part.count for part in listed]
+    told = connected_parts(number_instances(field, field.cameras), selection)
+    assert counts(capsys.readouterr().out.splitlines()[1:]) == [part.count for part in told]
+    assert main(["select", "chair", str(desk / "run"), "--distance", "0.3"]) == 0
+    *parts, note = capsys.readouterr().out.splitlines()[1:]
+    listed = connected_parts(field, selection, distance=0.3)
+    assert counts(parts) == [part.count for part in listed]
     left = listed[0].total - len(listed)
     assert left > 0
     assert note == f"  {left} smaller part{'s are' if left > 1 else ' is'} not listed"
     assert main(["select", "chair", str(desk / "run"), "--distance", "100"]) == 0
-    whole, joined = capsys.readouterr().out.splitlines()[1:]
+    [whole] = capsys.readouterr().out.splitlines()[1:]
     assert whole.startswith(f"  Part({len(selection)} Gaussians")
-    assert joined == "  parts are joined within 100; --distance changes it"

@@ -116,8 +116,8 @@ def _edits(place: Path, add: Add) -> None:
     write_splats(cloud(5), place / "lamp.ply")
     corner = InBox((0, 0, 0), (0.1, 0.1, 0.1))
     edits = EditList([
-        Recolor(["plant", corner], "#c04040", "hue"), Opacity("wall", 0.3), Move("chair", (0.5, 0, 0), ("z", 30), 1.5),
-        Duplicate(OfClass("chair", 0, 10.0), (1, 0, 0)), Remove("wall"), Insert(place / "lamp.ply"),
+        Recolor(["plant", corner], "#c04040"), Opacity("wall", 0.3), Move("chair", (0.5, 0, 0), ("z", 30), 1.5),
+        Duplicate(OfClass("chair", 0), (1, 0, 0)), Remove("wall"), Insert(place / "lamp.ply"),
     ])  # fmt: skip
     edits.undo().save(place / "a.edits.json")
     edits.save(place / "b.edits.json")

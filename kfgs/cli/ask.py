@@ -45,11 +45,11 @@ def select(
             view, if the cameras are known).
         threshold: Scores must be above it. For a field it is the paper's gamma; by default 0.5 for a relevancy, else derived
             from the scores. For a splat the default takes every Gaussian of the class.
-        distance: Gaussians at most this far apart are one part, in world units; by default from the spacing of the scene.
+        distance: Gaussians at most this far apart are one part, in world units. By default the views of a field tell things
+            apart, and the column `instance` of a splat; without both, the spacing of the scene decides.
     """
     from .._check import check_range
-    from ..labels import Selection
-    from ..labels.components import part_distance
+    from ..labels import Selection, number_instances
 
     if out is not None:
         check_output("out", out, "a folder")
@@ -65,7 +65,9 @@ def select(
             advice = "for any other phrase pass --teacher and --weights, or add it to the table of words"
             raise ValueError(f"{error}; {advice}") from error
         selection = field.query(query if phrase is None else phrase, label_set, threshold)
-        cloud, cameras = field.gaussians.replace(scores=selection.scores), field.cameras or None
+        by_views = phrase is None and distance is None and field.cameras
+        cloud = number_instances(field.label(label_set), field.cameras) if by_views else field.gaussians
+        cloud, cameras = cloud.replace(scores=selection.scores), field.cameras or None
         scene = classes.photos_of(field) if out is not None else None
     else:
         scene, cloud = classes.loaded, open_splats("source", source, named=True)
@@ -77,21 +79,17 @@ def select(
     if out is not None and len(selection) == 0:
         say(headline)
         raise ValueError(f"query: expected Gaussians to save, got none of {query!r}; lower the threshold or drop --out")
-    if distance is None and len(selection):
-        distance = part_distance(cloud.means, selection.mask)
     parts = kfgs.connected_parts(cloud, selection, cameras, distance=distance)
     if out is not None:  # before anything is printed, whose reader may have ended
         facts = {"query": query, "threshold": selection.threshold, "how": selection.how, "count": len(selection)}
         written = _save(out, facts | {"parts": parts}, cloud, selection, cameras, scene)
     say(headline)
     named = not is_field(source) and threshold is None  # parts are numbered as `kfgs edit` does
-    for number, part in enumerate(parts, start=1):
-        say(f"  {query}/{number}: {part!r}" if named else f"  {part!r}")
-    if parts:
-        say(f"  parts are joined within {distance:.3g}; --distance changes it")
-        left = parts[0].total - len(parts)
-        if left:
-            say(f"  {left} smaller part{'s are' if left > 1 else ' is'} not listed")
+    for part in parts:
+        say(f"  {query}/{part.number}: {part!r}" if named else f"  {part!r}")
+    left = parts[0].total - len(parts) if parts else 0
+    if left:
+        say(f"  {left} smaller part{'s are' if left > 1 else ' is'} not listed")
     if out is not None:
         wrote([out / name for name in written])
 

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from .._files import as_path, file_stem, read_json, write_json
 from ..fields.examples import Mask
-from ..labels.run_lengths import decode_rle
+from ..labels.classify import decode_rle
 from ..scenes.files import PIXELS
 from .truth import LabelTruth, ReadWhenAsked, is_void
 

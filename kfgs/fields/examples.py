@@ -19,7 +19,7 @@ from ..cameras import Camera
 from ..cameras.camera import view_named
 from ..gaussians import as_rows
 from ..labels import LabelSet, Selection
-from ..labels.run_lengths import decode_rle
+from ..labels.classify import decode_rle
 from .semantic_field import SemanticField
 
 

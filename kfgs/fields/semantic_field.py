@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -12,11 +13,11 @@ from torch import Tensor
 
 from .._card import html_card
 from .._check import as_tensor, check_shapes, check_whole
-from .._rows import unit_embeddings, unit_rows
+from .._rows import unit_embeddings
 from ..cameras import Camera
 from ..cameras.camera import view_named
 from ..gaussians import Gaussians, as_rows
-from ..labels import LabelSet, Selection
+from ..labels import LabelSet, Part, Selection, connected_parts, number_instances
 from ..labels.classify import Classification
 from ..labels.label_set import Classes, Negatives, check_rows, class_rows, make_question
 from ..labels.scores import Score
@@ -195,7 +196,7 @@ class SemanticField:
         """The Gaussians of one thing: those with a score above a threshold (gamma of Sec. 3.4).
 
         By default a Gaussian is selected if it is more similar to the target than to all negatives: the other classes for a
-        class, the canonical words for any other target. The score is then a relevancy (`labels.relevancy`), gamma 0.5.
+        class, the canonical words for any other target. The score is then LERF's relevancy, gamma 0.5.
 
         Args:
             target: the name of a class, or an embedding [D].
@@ -206,16 +207,14 @@ class SemanticField:
         """
         if score == "cosine" and isinstance(negatives, str) and negatives == "auto":
             negatives = "none"
-        source = self._source
-        latents, classes = source.gaussians.features, self.classes if classes is None else classes
-        assert latents is not None
-        rows = make_question(target, classes, negatives, self.decoder.dim, self.info)
-        named = isinstance(target, str) and isinstance(negatives, str)  # the rows of a label set are checked
-        unit = unit_rows(rows) if named else unit_embeddings(rows, "embedding, negatives")
-        with torch.no_grad():
-            cosines = source.decoder.cosines(latents, unit.to(latents))
-        against = cosines[:, 1:] if len(rows) > 1 else None
-        return select_by_similarity(cosines[:, 0], against, threshold, latents.any(dim=1), score)
+        classes = self.classes if classes is None else classes
+        cosines = self.cosines(make_question(target, classes, negatives, self.dim, self.info))
+        against = cosines[:, 1:] if cosines.shape[1] > 1 else None
+        return select_by_similarity(cosines[:, 0], against, threshold, self.known, score)
+
+    def instances(self, name: str, cameras: Sequence[Camera] | None = None) -> list[Part]:
+        """The things of a class ("the five chairs"), told apart by views, the field's by default (`labels.number_instances`)."""
+        return connected_parts(number_instances(self, cameras or self.cameras), name, cameras or self.cameras)
 
     def segment(self, camera: Camera | str, classes: Classes | None = None) -> Tensor:  # [H, W] int64
         """The class of each pixel from a viewpoint, -1 for empty pixels; the rule is that of the decoder."""

@@ -3,9 +3,10 @@
 from .classify import classify
 from .edit_list import EditList, Insert
 from .edits import Duplicate, Extract, Move, Opacity, Recolor, Remove
+from .instances import number_instances
 from .label_set import LabelSet, load_label_set
 from .parts import OrientedBox, Part, connected_parts
-from .selection import InBox, OfClass, Selection, relevancy
+from .selection import InBox, OfClass, Selection
 from .transfer import Transfer, nearest_labels, transfer_labels
 
 __all__ = [
@@ -28,6 +29,6 @@ __all__ = [
     "connected_parts",
     "load_label_set",
     "nearest_labels",
-    "relevancy",
+    "number_instances",
     "transfer_labels",
 ]

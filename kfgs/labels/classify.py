@@ -1,4 +1,4 @@
-"""From features to classes by max-similarity, and from rendered latents to codewords (both Sec. 3.4)."""
+"""From features to classes by max-similarity, from rendered latents to codewords (both Sec. 3.4), from COCO files to masks."""
 
 from __future__ import annotations
 
@@ -113,3 +113,25 @@ def _best_and_lead(layers: tuple[tuple[Tensor, Tensor], ...], rows: Tensor) -> t
     best, winners = largest(rows)
     second = rows.scatter_(1, winners[:, None], -torch.inf).amax(dim=1)
     return winners, torch.where(best > 0, (best - second) / best, 0)
+
+
+def decode_rle(segmentation: dict[str, Any]) -> Tensor:  # [H, W] bool
+    """COCO's mask `{"size": [H, W], "counts": ...}`: lengths of runs, zeros first, column by column; or its packed text.
+
+    Example:
+        >>> decode_rle({"size": [2, 2], "counts": [1, 2, 1]}).int().tolist()
+        [[0, 1], [1, 0]]
+    """
+    from pycocotools import mask as coco
+
+    size, counts = segmentation.get("size"), segmentation.get("counts")
+    try:
+        height, width = size  # type: ignore[misc]
+        if min(size) < 0 or height * width > 2**27 or (not isinstance(counts, str) and sum(counts) != height * width):  # type: ignore[arg-type]  # 2**27: as of a picture
+            raise ValueError("another size")
+        runs = segmentation if isinstance(counts, str) else coco.frPyObjects(segmentation, height, width)
+        return torch.from_numpy(coco.decode(runs)).bool()
+    except Exception as error:  # pycocotools raises bare exceptions
+        raise ValueError(
+            f"counts: expected runs that fill {size!r:.80} pixels, got {counts!r:.80} ({error})"
+        ) from error

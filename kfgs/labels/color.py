@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Literal
+from collections.abc import Sequence
 
 import torch
 from PIL import ImageColor
@@ -13,7 +12,6 @@ from ..gaussians import Gaussians
 from ..splat.sh import rgb_to_sh0, sh0_to_rgb
 from .selection import three_numbers
 
-Mode = Literal["tint", "hue"]
 LUMINANCE = (0.2126, 0.7152, 0.0722)  # Rec. 709 weights of R, G, B, on display values, in which blending is linear
 DARK = 1 / 255  # an object darker than one 8-bit step has no shading
 
@@ -45,15 +43,14 @@ def recolor(
     gaussians: Gaussians,
     mask: Tensor,  # [N] bool
     rgb: Sequence[float],  # [3] in [0, 1]
-    mode: Mode = "tint",
 ) -> Gaussians:
     """Give the Gaussians under the mask one hue and keep their shading: what the edit `Recolor` does.
 
     Each Gaussian's luminance L (Rec. 709, of its view-independent colour) is replaced by a colour T(L) on a curve from
     black over the shades of `rgb` to white (`shades`), and its view-dependent luminance follows the curve's slope there:
     `color(v) = T(L) + T'(L) (L(v) - L)`. That is linear in the spherical harmonics, so it holds from every direction, and
-    blending keeps it. `"tint"` makes the object's middle luminance (the median by visible area) `rgb`; if that was below
-    1/255, the colour is flat. `"hue"` keeps luminance: a dark plant stays dark. The paper says only "color modification".
+    blending keeps it. The object's middle luminance (the median by visible area) becomes `rgb`; if it was below 1/255, the
+    colour is flat. The paper says only "color modification".
     """
     if gaussians.sh is None:
         raise ValueError("gaussians.sh: expected spherical harmonics [N, K, 3], got None; pass the colour field")
@@ -62,10 +59,10 @@ def recolor(
     luminance = sh0_to_rgb(sh[:, 0]) @ weights  # [n], may be slightly negative: 3DGS clamps after summing
     middle = _middle(luminance.detach(), gaussians.opacities[mask].detach(), gaussians.scales[mask].detach())
     painted = torch.zeros_like(sh)
-    if mode == "tint" and float(middle) < DARK:
+    if float(middle) < DARK:
         painted[:, 0] = rgb_to_sh0(target)
     else:
-        colors, slopes = shades(target, middle if mode == "tint" else None)(luminance)
+        colors, slopes = shades(luminance, target, middle)
         painted[:, 0] = rgb_to_sh0(colors)
         painted[:, 1:] = (sh[:, 1:] @ weights)[..., None] * slopes[:, None]
     recoloured = gaussians.sh.clone()
@@ -82,31 +79,23 @@ def _middle(luminance: Tensor, opacities: Tensor, scales: Tensor) -> Tensor:  # 
     return luminance[order][int(torch.searchsorted(reached, reached[-1] / 2).clamp(max=len(order) - 1))]
 
 
-def shades(
-    rgb: Tensor,  # [3]
-    middle: Tensor | None,
-) -> Callable[[Tensor], tuple[Tensor, Tensor]]:  # [n] -> [n, 3], [n, 3]
-    """What replaces each luminance: a colour on the curve from black to white through the shades and tints of one hue.
+def shades(luminance: Tensor, rgb: Tensor, middle: Tensor) -> tuple[Tensor, Tensor]:  # [n], [3], [] -> [n, 3] x 2
+    """What replaces each luminance, a colour on the curve from black to white through the shades and tints of one hue.
 
-    The function gives the colours, and their change per unit of luminance. The old luminance L first becomes a tone t(L): L
-    without a `middle`; otherwise gain L, so that the middle becomes `rgb` and ratios stay, as at a change of albedo. If the
-    new colour is brighter, ratios hold up to a bend (the hue at its brightest, or halfway to white), and t goes linearly to 1
-    at L = 1. A tone is shown as saturated as possible: `peak t / knee` up to the knee, then linear to white. Black gives greys.
+    And the change of the colours per unit of luminance. The old luminance L first becomes a tone t(L) = gain L, so that the
+    middle becomes `rgb` and ratios stay, as at a change of albedo. If the new colour is brighter, ratios hold up to a bend
+    (the hue at its brightest, or halfway to white), and t goes linearly to 1 at L = 1. A tone is shown as saturated as
+    possible: `peak t / knee` up to the knee, then linear to white. Black gives greys.
     """
     weights = rgb.new_tensor(LUMINANCE)
     peak = rgb / rgb.max() if float(rgb.max()) > 0 else torch.ones_like(rgb)  # the brightest colour of this hue
     knee = peak @ weights
-    gain = torch.ones_like(knee) if middle is None else rgb @ weights / middle
+    gain = rgb @ weights / middle
     bend = torch.minimum(knee, (1 + rgb @ weights) / 2) / gain if float(gain) > 1 else torch.full_like(knee, torch.inf)
     straight = (1 - gain * bend) / (1 - bend) if float(gain) > 1 else gain
     to_white = (1 - peak) / (1 - knee) if float(1 - knee) > 1e-6 else torch.ones_like(peak)  # greys stay grey
-
-    def shade(luminance: Tensor) -> tuple[Tensor, Tensor]:
-        tone = gain * luminance.clamp(max=bend) + straight * (luminance - bend).clamp(min=0)
-        rate = torch.where(luminance > bend, straight, gain)
-        above = (tone > knee)[:, None]
-        slopes = torch.where(above, to_white, peak / knee)
-        colors = torch.where(above, peak + to_white * (tone - knee)[:, None], slopes * tone[:, None])
-        return colors, slopes * rate[:, None]
-
-    return shade
+    tone = gain * luminance.clamp(max=bend) + straight * (luminance - bend).clamp(min=0)
+    above = (tone > knee)[:, None]
+    slopes = torch.where(above, to_white, peak / knee)
+    colors = torch.where(above, peak + to_white * (tone - knee)[:, None], slopes * tone[:, None])
+    return colors, slopes * torch.where(luminance > bend, straight, gain)[:, None]

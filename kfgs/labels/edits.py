@@ -7,19 +7,19 @@ from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, get_args
+from typing import Any, ClassVar
 
 import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from .._card import cut
-from .._check import check_choice, check_range
+from .._check import check_range
 from .._origin import Origin, to_world
 from ..cameras.similarity import Similarity
 from ..gaussians import Gaussians
 from ..splat.transform import transform_gaussians
-from .color import Mode, parse_color, recolor
+from .color import parse_color, recolor
 from .selection import Rule, Selection, as_rule, as_selection, class_names, plain_fields, set_fields, three_numbers
 from .transfer import as_cloud
 
@@ -46,7 +46,7 @@ class OnSelection(Edit):
     """An edit of the Gaussians that rules select."""
 
     where: str | Selection | Rule | Sequence[str | Selection | Rule]
-    """A class name, a selection or a rule (`OfClass`, `InBox`, `InSphere`, `OfIndex`); or several: what any of them selects."""
+    """A class name, a selection or a rule (`OfClass`, `InBox`, `OfIndex`); or several: what any of them selects."""
 
     def __post_init__(self) -> None:
         where: Any = self.where
@@ -101,17 +101,14 @@ class Recolor(OnSelection):
 
     op: ClassVar[str] = "recolor"
     rgb: str | tuple[float, ...]
-    """Red, green, blue in [0, 1], or text like `"#c04040"` or `"teal"`."""
-    mode: Mode = "tint"
-    """`"tint"`: the object's middle luminance becomes `rgb`. `"hue"`: luminance stays."""
+    """Red, green, blue in [0, 1], or text like `"#c04040"` or `"teal"`: the new colour of the object's middle luminance."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         set_fields(self, rgb=parse_color(self.rgb))
-        check_choice("mode", self.mode, get_args(Mode))
 
     def _change(self, gaussians: Gaussians, mask: Tensor) -> Gaussians:
-        return recolor(gaussians, mask, parse_color(self.rgb), self.mode)
+        return recolor(gaussians, mask, parse_color(self.rgb))
 
 
 @dataclass(frozen=True)

@@ -155,12 +155,7 @@ def class_rows(classes: Classes, dim: int, info: dict[str, Any]) -> Tensor:  # [
         try:
             rows = as_tensor("embeddings", classes, floating=True)
         except TypeError as error:
-            got = (
-                f"the name {classes!r}, for which there is query"
-                if isinstance(classes, str)
-                else type(classes).__name__
-            )
-            got = f"{got}; load_label_set reads one, make_label_set makes one"
+            got = f"{type(classes).__name__} {classes!r:.60}; query takes a name, load_label_set reads classes"
             raise TypeError(f"classes: expected a LabelSet or embeddings [C, {dim}], got {got}") from error
         check_rows("embeddings", rows, ("C",), dim)
         return rows
@@ -209,14 +204,20 @@ def make_question(
     against = rows[_unlike(rows, row)]
     of_class = isinstance(target, str) or len(against) < len(rows)
     if negatives == "canonical" or (negatives == "auto" and not (of_class and len(against))):
-        against = _canonical(table, words, row)
+        against = rows[:0]
+        if table is not None and table.negatives is not None:  # without the target, known by its words or its embedding
+            other = torch.tensor([word.casefold() != words.casefold() for word in table.negative_names])
+            against = table.negatives[_unlike(table.negatives, row) & other.to(table.negatives.device)]
     elif negatives not in ("auto", "classes"):
         check_choice("negatives", negatives, get_args(Negatives))
         against = rows[:0]
-    if len(against) == 0 and negatives == "classes":
-        raise ValueError(f"negatives: expected other classes than {words!r}, got none; use 'canonical' or 'none'")
-    if len(against) == 0 and negatives == "canonical":
-        raise ValueError("negatives: expected canonical words in a table, got none; `kfgs features --words` adds some")
+    if len(against) == 0 and negatives in ("classes", "canonical"):
+        what = (
+            f"classes than {words!r}"
+            if negatives == "classes"
+            else "canonical words (`kfgs features --words` adds some)"
+        )
+        raise ValueError(f"negatives: expected other {what}, got none; use another, or 'none'")
     return torch.cat([row[None], against.to(row)])
 
 
@@ -226,15 +227,6 @@ def check_rows(name: str, rows: Tensor, axes: Sequence[str], dim: int) -> None:
         expected, got = ", ".join((*axes, str(dim))), tuple(rows.shape)
         raise ValueError(f"{name}: expected [{expected}], got {got}: text of another teacher? If so, {AGAIN}")
     check_shapes((name, rows, (*axes, dim)))
-
-
-def _canonical(classes: LabelSet | None, words: str, row: Tensor) -> Tensor:  # [M, D]
-    """The canonical negatives without the target, which is recognised by its words or its embedding."""
-    if classes is None or classes.negatives is None:
-        return row.new_zeros(0, len(row))
-    other_words = torch.tensor([word.casefold() != words.casefold() for word in classes.negative_names])
-    kept = _unlike(classes.negatives, row) & other_words.to(classes.negatives.device)
-    return classes.negatives[kept]
 
 
 def _unlike(rows: Tensor, row: Tensor) -> Tensor:  # [M, D], [D] -> [M] bool

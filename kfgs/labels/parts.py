@@ -15,13 +15,12 @@ from .._origin import to_world
 from .._rows import check_finite
 from ..cameras import Camera
 from ..gaussians import Gaussians
-from ..splat.views import sum_pixels
-from .components import number_parts
+from ..splat.rasterize import rasterize
+from .components import SPECK, number_parts
 from .selection import as_selection
 from .transfer import as_cloud
 
 LONGEST = 160  # longer side in pixels of the views compared; on room_0 shares change by at most 0.3 % of the picture
-SPECK = 0.05  # parts smaller than this share of the largest are left out
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,6 +90,7 @@ class Part:
     extent: tuple[Tensor, Tensor]  # lowest and highest corner [3] along the world's axes
     best_view: BestView | None  # None without cameras, or if no camera shows any of it
     how: str  # how it was selected
+    number: int = 1  # what `OfClass` and the command line call it: chair/2
     total: int = 1  # how many connected parts the selection has, including those that are left out
 
     @property
@@ -109,6 +109,7 @@ class Part:
     def to_json(self) -> dict[str, Any]:
         """Plain numbers, lists and strings."""
         return {
+            "number": self.number,
             "count": self.count,
             "score": self.score,
             "centroid": self.centroid.tolist(),
@@ -130,13 +131,16 @@ def connected_parts(
     smallest: int | None = None,
     most: int = 100,
 ) -> list[Part]:
-    """Split a selection of these Gaussians into its connected parts ("the four chairs"), largest first.
+    """Split a selection of these Gaussians into its parts ("the four chairs"), largest first.
+
+    A cloud with the column `instance` (`number_instances`) has the things that it says, others have connected parts.
 
     Args:
         gaussians: a cloud or a field.
         selection: a class name, a `Selection`, a rule, several of these, or a mask [N]; an empty one has no parts.
         cameras: views without distortion, to find the best one of each part.
-        distance: Gaussians at most this far apart are connected, in world units; None takes it from their spacing.
+        distance: Gaussians at most this far apart are connected, in world units, whatever the column says; None takes it from
+            their spacing.
         smallest: parts with fewer Gaussians are left out; None: those below 5 % of the largest.
         most: the most parts to return.
     """
@@ -146,15 +150,17 @@ def connected_parts(
     check_whole("most", most, 1)
     if distance is not None:
         check_range("distance", distance, 0, closed=(False, False))
-    numbers = number_parts(gaussians.means, selection.mask, distance)
-    sizes = torch.bincount(numbers[selection.mask])
+    numbers = number_parts(gaussians, selection.mask, distance)
+    names, sizes = numbers[numbers >= 0].unique(return_counts=True)
     if len(sizes) == 0:
         return []
-    least = SPECK * int(sizes[0]) if smallest is None else smallest
-    kept = int((sizes[:most] >= least).sum())
-    order = torch.argsort(numbers, stable=True)[int((numbers < 0).sum()) :]  # part by part, ascending in each
-    members, parts = list(order.split(sizes.tolist())[:kept]), []
-    shares = _view_shares(gaussians, members, cameras or [])
+    order = torch.argsort(sizes, descending=True, stable=True)[:most]
+    least = SPECK * int(sizes.max()) if smallest is None else smallest
+    kept = names[order[sizes[order] >= least]].tolist()
+    members, parts = [(numbers == name).nonzero()[:, 0] for name in kept], []
+    marks = (numbers[:, None] == numbers.new_tensor(kept)).to(gaussians.means)
+    shown, views = gaussians.replace(features=marks), [camera.fitted(LONGEST) for camera in cameras or ()]
+    shares = torch.stack([rasterize(shown, view).map.mean(dim=(0, 1)) for view in views] or [torch.zeros(len(kept))])
     for i, indices in enumerate(members):
         points = to_world(gaussians.means[indices].detach().double(), gaussians.origin)
         view = None
@@ -164,17 +170,5 @@ def connected_parts(
         score, extent = float(selection.scores[indices].double().mean()), (points.amin(dim=0), points.amax(dim=0))
         place, box = points.mean(dim=0), OrientedBox.around(points)
         how = f"{selection.how}; part {i + 1} of {len(sizes)}"
-        parts.append(Part(gaussians[indices], indices, score, place, box, extent, view, how, len(sizes)))
+        parts.append(Part(gaussians[indices], indices, score, place, box, extent, view, how, kept[i] + 1, len(sizes)))
     return parts
-
-
-def _view_shares(gaussians: Gaussians, parts: list[Tensor], cameras: Sequence[Camera]) -> Tensor:  # [C, P]
-    """The share of each camera's picture that each part fills: the mean over pixels of its rendering weights w = T alpha."""
-    shares = torch.zeros(len(cameras), len(parts)).to(gaussians.means)
-    for c, camera in enumerate(cameras):
-        small = camera.fitted(LONGEST)
-        with torch.no_grad():
-            index, _, weights = sum_pixels(gaussians, small, torch.ones(*small.size, 1).to(shares))
-        whole = torch.zeros(len(gaussians)).to(shares).index_add_(0, index, weights.to(shares))
-        shares[c] = torch.stack([whole[part].sum() for part in parts]) / (small.width * small.height)
-    return shares

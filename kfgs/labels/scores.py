@@ -20,9 +20,7 @@ BINS = 128
 SMOOTHING = 2.0  # standard deviation, in bins
 PER = 30_000  # counts are scaled to this many features, so that two copies of a cloud have the threshold of one
 CLEAR = 0.3  # a gap is clear if its floor is at least 2 x (10^0.3) sparser than the mode on either side
-SHARES = ((0.5, CLEAR), (0.75, 0.7))
-"""A gap with more than half of the scene above it usually separates two parts of the background. If there is no other, up
-to three quarters may lie above it (the walls of a room), if it is 5 times sparser than the modes next to it."""
+SHARE = 0.75  # a gap with more of the scene above it separates two parts of the background
 TOP, WAY = 0.999, 0.7  # if no gap is clear: 70 % of the way from the median to the 99.9 % quantile
 
 
@@ -31,7 +29,7 @@ def similarity_threshold(scores: Tensor) -> tuple[float, str]:  # scores: [N]
 
     A target is often a hundredth of the scene, and the rest has several modes, which Otsu's threshold would cut in two (IoU
     0.02 on mixtures with 1 % targets). So the smoothed histogram is read in log counts. A gap counts if it is at least half
-    as deep as the deepest one and at most half of the scores lie above it (see `SHARES`). The cut is at the floor of the
+    as deep as the deepest one and at most three quarters of the scores lie above it. The cut is at the floor of the
     highest of these gaps. If no gap is clear (one mode, or modes that overlap), the cut is 70 % of the way from the median
     to the 99.9 % quantile.
 
@@ -49,15 +47,12 @@ def similarity_threshold(scores: Tensor) -> tuple[float, str]:  # scores: [N]
     density = np.log10(1 + gaussian_filter1d(counts * (PER / values.size), SMOOTHING, mode="constant"))
     highest_below = np.maximum.accumulate(density)
     highest_above = np.maximum.accumulate(density[::-1])[::-1]
-    depth = np.minimum(highest_below, highest_above) - density
     above = 1 - np.cumsum(counts) / values.size
-    parts = ((np.arange(BINS) >= _past_flank(density, above, share), clear) for share, clear in SHARES)
-    candidates = [depth * part for part, clear in parts if (depth * part).max() >= clear]
-    if not candidates:
+    depth = (np.minimum(highest_below, highest_above) - density) * (np.arange(BINS) >= _past_flank(density, above))
+    if depth.max() < CLEAR:
         median, top = np.quantile(values, (0.5, TOP))
         how = f"no clear gap between modes: {WAY:.0%} of the way from the median {median:.3f} to the top {top:.3f}"
         return float(median + WAY * (top - median)), how
-    depth = candidates[0]
     deep = np.flatnonzero(depth >= depth.max() / 2)
     gap = np.split(deep, np.flatnonzero(np.diff(deep) > 1) + 1)[-1]  # the last run of neighbouring bins
     floor = gap[density[gap] <= density[gap].min() + 1e-9]
@@ -65,9 +60,9 @@ def similarity_threshold(scores: Tensor) -> tuple[float, str]:  # scores: [N]
     return threshold, f"gap at {threshold:.3f}: {sparser:.0f} x sparser than the modes beside it ({values.size} scores)"
 
 
-def _past_flank(density: Array, above: Array, share: float) -> int:
-    """The first bin with at most `share` of the scores above it; if a mode rises there, the bin after its flank."""
-    start = int(np.argmax(above <= share))
+def _past_flank(density: Array, above: Array) -> int:
+    """The first bin with at most three quarters of the scores above it; if a mode rises there, the bin after its flank."""
+    start = int(np.argmax(above <= SHARE))
     while 0 < start < BINS and density[start] > density[start - 1]:
         start += 1
     return start

@@ -1,4 +1,4 @@
-"""Selections of Gaussians: from cosines with a query (Sec. 3.4), or by rules: class, index, box or sphere.
+"""Selections of Gaussians: from cosines with a query (Sec. 3.4), or by rules: class, index or box.
 
 A `Selection` holds for one cloud. A rule works on any: `OfClass("chair").select(gaussians)` is a `Selection`. Edits hold rules,
 and JSON can. `as_selection` takes whatever a person holds.
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from functools import reduce
 from operator import or_
@@ -20,8 +20,8 @@ import torch
 from torch import Tensor
 
 from .._arrays import Array
-from .._card import cut, say_coordinate
-from .._check import as_tensor, check_choice, check_range, check_shapes, check_whole, class_indices
+from .._card import cut
+from .._check import as_tensor, check_choice, check_range, check_whole, class_indices
 from .._origin import to_world
 from .._rows import check_finite
 from ..cameras.similarity import Similarity
@@ -87,12 +87,10 @@ class Selection:
         return self.how if self.threshold is None else f"score > {self.threshold:.4g} ({self.how})"
 
     def __and__(self, other: Selection) -> Selection:
-        scores = torch.minimum(*self._both_scores(other))
-        return Selection(self.mask & other.mask, scores, None, f"({self.summary}) and ({other.summary})")
+        return self._with(other, "and", torch.logical_and, torch.minimum)
 
     def __or__(self, other: Selection) -> Selection:
-        scores = torch.maximum(*self._both_scores(other))
-        return Selection(self.mask | other.mask, scores, None, f"({self.summary}) or ({other.summary})")
+        return self._with(other, "or", torch.logical_or, torch.maximum)
 
     def __invert__(self) -> Selection:
         return Selection(~self.mask, 1 - self.scores, None, f"not ({self.summary})")
@@ -100,41 +98,15 @@ class Selection:
     def __sub__(self, other: Selection) -> Selection:
         return self & ~other
 
-    def _both_scores(self, other: Selection) -> tuple[Tensor, Tensor]:
-        """Both scores in one dtype, after a check that both select among the same Gaussians."""
+    def _with(self, other: Selection, word: str, both: Callable[..., Tensor], pick: Callable[..., Tensor]) -> Selection:
         if not isinstance(other, Selection):
             raise TypeError(f"other: expected a Selection, got {type(other).__name__}; make one by Selection.of(mask)")
         if len(self.mask) != len(other.mask):
             own, its = len(self.mask), len(other.mask)
             raise ValueError(f"other: expected a selection among the same {own} Gaussians, got one among {its}")
         dtype = torch.promote_types(self.scores.dtype, other.scores.dtype)
-        return self.scores.to(dtype), other.scores.to(self.scores.device, dtype)
-
-
-def relevancy(
-    similarity: Tensor,  # [N]
-    negatives: Tensor,  # [N, M]
-) -> Tensor:  # [N] in (0, 1)
-    """LERF's relevancy (Kerr 2023, Sec. 3.4): how much more similar to the query than to the most similar negative.
-
-    min over j of the first entry of softmax(10 [s, n_j]), which is sigmoid(10 (s - max_j n_j)), from cosines with the query
-    and with negatives (the other classes of the scene, or `LabelSet.negatives`). Above 0.5 the query is more similar than
-    every negative. A ValueError if shapes disagree, there is no negative, or a number is not finite.
-
-    Example:
-        >>> relevancy(torch.tensor([0.9, 0.3]), torch.tensor([[0.2, 0.9], [0.1, 0.2]])).tolist()
-        [0.5, 0.7310585975646973]
-    """
-    check_shapes(("similarity", similarity, "N"), ("negatives", negatives, "N M"))
-    if negatives.shape[1] == 0:
-        raise ValueError("negatives: expected at least one column, got none; pass what the query should not find")
-    check_finite("similarity", similarity)
-    check_finite("negatives", negatives)
-    return _relevancy(similarity, negatives)
-
-
-def _relevancy(similarity: Tensor, negatives: Tensor) -> Tensor:
-    return torch.sigmoid(TEMPERATURE * (similarity - negatives.amax(dim=1)))
+        scores = pick(self.scores.to(dtype), other.scores.to(self.scores.device, dtype))
+        return Selection(both(self.mask, other.mask), scores, None, f"({self.summary}) {word} ({other.summary})")
 
 
 def select_by_similarity(
@@ -146,9 +118,11 @@ def select_by_similarity(
 ) -> Selection:
     """Select the Gaussians with a score above gamma, from cosines with a query and its negatives (`SemanticField.query`).
 
-    Without a `threshold`, gamma is 0.5 for a relevancy: more similar to the query than to any negative. For a cosine,
-    `similarity_threshold` finds it in the scores. Gaussians that are not `known` have score 0 and no influence on gamma. On
-    room_0 (mean IoU over 18 classes with the data set's labels): cosine 0.88, relevancy 0.90.
+    The relevancy of LERF (Kerr 2023, Sec. 3.4) is min over j of the first entry of softmax(10 [s, n_j]), which is
+    sigmoid(10 (s - max_j n_j)). Above 0.5, which is gamma without a `threshold`, the Gaussian is more similar to the query
+    than to any negative. For a cosine, `similarity_threshold` finds gamma in the scores. Gaussians that are not `known` have
+    score 0 and no influence on gamma. On room_0 (mean IoU over 18 classes with the data set's labels): cosine 0.88,
+    relevancy 0.90.
     """
     score = score or ("cosine" if negatives is None else "relevancy")
     gamma, how, scores = threshold, "given", similarity
@@ -157,7 +131,7 @@ def select_by_similarity(
         if negatives is None:
             raise ValueError("negatives: expected some for a relevancy, got none; pass words that are not meant")
         check_finite("negatives", negatives)
-        scores = _relevancy(similarity, negatives)
+        scores = torch.sigmoid(TEMPERATURE * (similarity - negatives.amax(dim=1)))
         if gamma is None:
             gamma, how = EVEN, f"more like the query than like any of {negatives.shape[1]} negatives"
     elif score != "cosine":
@@ -199,17 +173,13 @@ class OfClass(Rule):
     name: str | int
     """A name (exact, or else without regard to case; an unknown one is an error), or an index, -1 for those without a label."""
     part: int | None = None
-    """Which connected part: 0 is the largest, one past the last is an error. None: all of the class."""
-    distance: float | None = None
-    """Gaussians at most this far apart are in one part, world units; None takes it from their spacing."""
+    """Which part, as `connected_parts` counts: 0 is the largest, one past the last is an error. None: all of the class."""
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str):
             check_whole("name", self.name, -1, 2**31 - 1)
         if self.part is not None:
             check_whole("part", self.part, 0)
-        if self.distance is not None:
-            check_range("distance", self.distance, 0, closed=(False, False))
 
     def _find(self, gaussians: Gaussians) -> tuple[Tensor, str]:
         labels = gaussians.labels
@@ -218,15 +188,14 @@ class OfClass(Rule):
         indices = class_indices(self.name, gaussians.names) if isinstance(self.name, str) else (self.name,)
         mask, how = torch.isin(labels, torch.tensor(indices, device=labels.device)), f"label {self.name}"
         if self.part is not None:
-            parts = number_parts(gaussians.means, mask, self.distance)
-            count = len(parts[mask].unique())
-            if count == 0:
+            parts = number_parts(gaussians, mask)
+            known = (parts[parts >= 0].unique() + 1).tolist()
+            if not known:
                 raise ValueError(f"part: expected a class of some Gaussians, got {self.name}, which none has")
-            if self.part >= count:
-                raise ValueError(
-                    f"part: expected 1 to {count}, got {self.name}/{self.part + 1}; `kfgs select` lists them"
-                )
-            mask, how = parts == self.part, f"{how}; part {self.part + 1} of {count}"
+            if self.part + 1 not in known:
+                numbers = f"1 to {len(known)}" if known[-1] == len(known) else cut(str(known), 80)
+                raise ValueError(f"part: expected {numbers}, got {self.name}/{self.part + 1}; `kfgs select` lists them")
+            mask, how = parts == self.part, f"{how}; part {self.part + 1} of {len(known)}"
         return mask, how
 
 
@@ -250,25 +219,6 @@ class InBox(Rule):
         inside = (points >= points.new_tensor(self.min)) & (points <= points.new_tensor(self.max))
         size = " x ".join(f"{b - a:.4g}" for a, b in zip(self.min, self.max, strict=True))
         return inside.all(dim=1), f"in a box of {size}"
-
-
-@dataclass(frozen=True)
-class InSphere(Rule):
-    """The Gaussians whose centres are at most `radius` from `center`, world units."""
-
-    kind: ClassVar[str] = "sphere"
-    center: tuple[float, ...]
-    radius: float
-
-    def __post_init__(self) -> None:
-        set_fields(self, center=three_numbers("center", self.center))
-        check_range("radius", self.radius, 0, closed=(False, False))
-
-    def _find(self, gaussians: Gaussians) -> tuple[Tensor, str]:
-        points = _points(gaussians)
-        inside = (points - points.new_tensor(self.center)).norm(dim=1) <= self.radius
-        center = ", ".join(say_coordinate(x, 4) for x in self.center)
-        return inside, f"within {self.radius:.4g} of ({center})"
 
 
 @dataclass(frozen=True)
@@ -303,7 +253,7 @@ def class_names(gaussians: Gaussians) -> tuple[str, ...]:
     return (*names, *(f"class {i}" for i in range(len(names), count)))
 
 
-KINDS: dict[str, type[Rule]] = {kind.kind: kind for kind in (OfClass, InBox, InSphere, OfIndex)}
+KINDS: dict[str, type[Rule]] = {kind.kind: kind for kind in (OfClass, InBox, OfIndex)}
 
 
 def as_selection(value: Any, gaussians: Gaussians, name: str = "selection") -> Selection:

@@ -18,7 +18,7 @@ from .._origin import recounted
 from .._rows import check_finite
 from ..gaussians import Gaussians
 
-CHUNK = 16_384  # destinations at a time
+INSTANCE = "instance"  # the column of `Gaussians.extra` that tells the things of a class apart: 1, 2, ...; 0 = none
 SAMPLE = 20_000  # Gaussians measured for lambda or a spacing
 COVERAGE = 0.995  # lambda reaches this share of the destinations ...
 NEAREST = 2.0  # ... but is at least this many median spacings of the sources ...
@@ -61,8 +61,8 @@ def transfer_labels(source: Any, target: Gaussians, distance: float | None = Non
     """Label a splat by distance: `transfer_labels(field, read_splats("mine.ply"))`.
 
     The source is a field, or labelled Gaussians; the rule is that of `nearest_labels`, which also says who gave each label.
-    The target gets new `labels`, `scores` (1 - distance / lambda), and the class names of the source. Both clouds must share
-    one frame; `kfgs.attach` finds the common frame, and can label by views instead of by distance.
+    The target gets new `labels`, `scores` (1 - distance / lambda), and the source's class names and column `instance`. Both
+    clouds must share one frame; `kfgs.attach` finds the common frame, and can label by views instead of by distance.
 
     A ValueError if the source has no labels, a position is not finite, or the distance is not positive.
 
@@ -75,7 +75,9 @@ def transfer_labels(source: Any, target: Gaussians, distance: float | None = Non
     source, target = as_cloud(source, "source", labelled=True), as_cloud(target, "target")
     places = recounted(target.means, target.origin, source.origin)
     carried = nearest_labels(source.means, source.labels, places, distance)
-    return target.replace(labels=carried.labels, scores=carried.scores.to(target.means.dtype), names=source.names)
+    things = {INSTANCE: np.append(source.extra[INSTANCE], 0)[carried.sources.cpu()]} if INSTANCE in source.extra else {}
+    scores, extra = carried.scores.to(target.means.dtype), {**target.extra, **things}
+    return target.replace(labels=carried.labels, scores=scores, names=source.names, extra=extra)
 
 
 def nearest_labels(
@@ -87,8 +89,8 @@ def nearest_labels(
     """Give each destination the label of the nearest labelled source **strictly** closer than `distance`.
 
     The rule of Sec. 3.4; `distance` is its lambda, in world units. The paper does not say which label wins if several are
-    in range: here the nearest does. Of equally near sources (as float64 distances), the one with the lowest index gives its
-    label. Both clouds are counted from the same origin.
+    in range: here the nearest does, and of sources at one position the one with the lowest index. Both clouds are counted
+    from the same origin.
 
     The paper gives no value for lambda either. Without one, it is the distance within which 99.5 % of the destinations have
     a source, but at least 2 median spacings of the sources (a spacing is the distance to the nearest other source), so that
@@ -134,27 +136,16 @@ class Sources:
         self.tree = cKDTree(points[self.index])
 
     def nearest(self, points: Array, distance: float = np.inf) -> tuple[Array, Array]:  # [N] float64, [N] int64
-        """Distance and index of the nearest source **strictly** closer than `distance`; infinite and -1 if there is none.
-
-        Of equally near ones it is the lowest index. scipy returns them in any order: while all are equally near, ask for more.
-        """
+        """Distance and index of the nearest source **strictly** closer than `distance`; infinite and -1 if there is none."""
         distances, index = np.full(len(points), np.inf), np.full(len(points), -1)
         if not (len(points) and len(self.index)):
             return distances, index
         # neighbours follow each other: a tree answers twice as fast
         cell = max(float(np.ptp(points, axis=0).max()) / 64, np.finfo(np.float64).tiny)
         order: Array = np.lexsort(np.floor((points - points.min(axis=0)) / cell).T)
-        n, gaussian = len(self.index), np.append(self.index, -1)  # scipy's index of none is n
-        for left in (order[i : i + CHUNK] for i in range(0, len(points), CHUNK)):
-            k = 1
-            while left.size:
-                k = min(2 * k, n)
-                near, which = self.tree.query(points[left], k=k, distance_upper_bound=distance, workers=-1)
-                near, which = np.reshape(near, (len(left), k)), np.reshape(which, (len(left), k))
-                near[near >= distance] = np.inf  # scipy compares squares, which rounds otherwise
-                tied = (near == near[:, :1]) & np.isfinite(near)
-                distances[left], index[left] = near[:, 0], gaussian[np.where(tied, which, n).min(axis=1)]
-                left = left[tied.all(axis=1) & (k < n)]
+        near, which = self.tree.query(points[order], distance_upper_bound=distance, workers=-1)
+        near = np.where(near < distance, near, np.inf)  # scipy compares squares, which rounds otherwise
+        distances[order], index[order] = near, np.where(np.isfinite(near), np.append(self.index, -1)[which], -1)
         return distances, index
 
     def default_distance(self, targets: Array) -> tuple[float, str]:

@@ -22,7 +22,7 @@ from ..formats.ply import points_from_columns, read_header, read_ply, write_ply
 from ..formats.ply_3dgs import label_column
 from ..formats.sidecar import write_names
 from ..gaussians import Gaussians
-from ..labels import LabelSet, Transfer, nearest_labels
+from ..labels import LabelSet, Transfer, nearest_labels, number_instances
 from ..scenes import SceneError, align_by_cameras, frames_agree
 from ..scenes.frames import Alignment
 from ..splat import transform_gaussians, vote_labels
@@ -40,7 +40,7 @@ class Attached:
     """A splat with classes, and how they were found."""
 
     gaussians: Gaussians
-    """The splat in its own frame, with labels, scores and class names."""
+    """The splat in its own frame, with labels, scores, class names, and things told apart (`number_instances`)."""
     transfer: Transfer
     """The labels decided by distance: of every Gaussian (`by="distance"`), or of those without a label by views."""
     similarity: Similarity
@@ -53,9 +53,8 @@ class Attached:
     """The same as JSON; `write_splats(..., facts=)` keeps them with the class names."""
 
     def __repr__(self) -> str:
-        labelled, within = int((self.labels >= 0).sum()), f"lambda {self.transfer.distance:.4g}"
-        total, names = len(self.gaussians), len(self.gaussians.names)
-        return f"Attached({labelled:,} of {total:,} Gaussians labelled, {names} classes, {within})"
+        g, labelled, within = self.gaussians, int((self.labels >= 0).sum()), f"lambda {self.transfer.distance:.4g}"
+        return f"Attached({labelled:,} of {len(g):,} Gaussians labelled, {len(g.names)} classes, {within})"
 
     @property
     def labels(self) -> Tensor:  # [N] int64
@@ -136,7 +135,6 @@ def attach(
             "labelled by": f"votes of {len(cameras)} segmented views",
             "score": f"share of the votes; where no view shows a Gaussian, {NEARNESS}, to those that have a class",
             "shown": len(splats) - len(transfer.labels),
-            "not shown": len(transfer.labels),
         }
     counts = torch.bincount(labels + 1, minlength=len(semantic.names) + 1).tolist()
     facts = {
@@ -154,6 +152,8 @@ def attach(
         ways.append(f"{transfer.labelled:,} {who} by distance (lambda {transfer.distance:.3g})")
     note = f"{how['labelled by']}: of {len(splats):,} Gaussians {', '.join(ways)}, {transfer.orphaned:,} got none"
     labelled = splats.replace(labels=labels, scores=scores.float(), names=semantic.names)
+    if cameras:
+        labelled = number_instances(labelled, [similarity.apply_to_camera(camera) for camera in cameras])
     return Attached(labelled, transfer, similarity, alignment, (frame_note, note), facts)
 
 

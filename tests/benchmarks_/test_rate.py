@@ -4,7 +4,6 @@ import dataclasses
 
 import pytest
 import rate
-import torch
 from cases_packed import field
 
 from kfgs.fields.packing import SMALL
@@ -25,16 +24,6 @@ class Room:
 def made():
     whole = field("fused", n=500)
     return dataclasses.replace(whole, gaussians=whole.gaussians.replace(labels=None))
-
-
-def test_every_format_carries_the_labels_of_the_field(made, tmp_path):
-    room = Room(made)
-    points = rate.carried(room, made, tmp_path)
-    assert [one.kind for one in points] == ["ply", "spz", "spz", "sog", "sog"]
-    stored = made.classify(room.classes).labels
-    assert torch.equal(room.seen[0], stored)  # PLY keeps every number
-    for labels in room.seen[1:]:  # SPZ and SOG may sort
-        assert ((labels + 1).bincount() - (stored + 1).bincount()).abs().max() <= 5
 
 
 def test_the_curve_falls_in_size_as_its_errors_grow(made, tmp_path):

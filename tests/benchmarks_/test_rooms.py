@@ -73,12 +73,6 @@ def test_test_views_show_what_training_views_saw():
         assert (count >= 2).mean() >= rooms_path.KNOWN - 0.05  # judged on other pixels
 
 
-def test_plan_follows_from_the_seed():
-    first, again, other = (np.stack(list(plan(seed).values())) for seed in (3, 3, 4))
-    assert (first == again).all()
-    assert np.abs(first - other).max() > 0.1
-
-
 def test_a_place_in_the_table_or_outside_is_refused():
     for place in ([2.2, 2.0, 1.0], [9.0, 9.0, 1.0]):
         with pytest.raises(ValueError, match="inside: expected a place"):
@@ -118,30 +112,6 @@ def make_scene(out):
     return poses
 
 
-def agreement(out, lens, poses):
-    """Whether a place has one class in all views: the share of pixels, and their number.
-
-    A pixel counts if another view shows its place (z-depth within 1 %), and the pixels around it have one class in both.
-    """
-    right, total, shown, stems = 0, 0, {}, list(poses)
-    for stem in stems:
-        labels = np.pad(np.array(Image.open(out / "labels" / f"{stem}.png")), 2, constant_values=rooms.VOID)
-        around = np.lib.stride_tricks.sliding_window_view(labels, (5, 5))
-        inner = (around.min((2, 3)) == around.max((2, 3))) & (labels[2:-2, 2:-2] != rooms.VOID)
-        shown[stem] = labels[2:-2, 2:-2], inner, np.load(out / "depth" / f"{stem}.npy")
-    for k, stem in enumerate(stems):
-        origins, directions, lengths = lens.rays(poses[stem])
-        points = origins + directions * (lengths * shown[stem][2].ravel())[:, None]
-        for name in (stems[k - 1], stems[k - len(stems) // 3]):
-            xy, z = lens.pixels(poses[name], points)
-            rows = np.flatnonzero(np.isfinite(xy[:, 0]) & shown[stem][1].ravel())
-            labels, inner, depth = (each[tuple(xy[rows, ::-1].astype(int).T)] for each in shown[name])
-            same = inner & (np.abs(depth - z[rows]) < 0.01 * z[rows])
-            total += int(same.sum())
-            right += int((labels == shown[stem][0].ravel()[rows])[same].sum())
-    return right / max(total, 1), total
-
-
 def test_kfgs_opens_the_scene(tmp_path):
     made = make_scene(tmp_path)
     scene, truth = load_scene(tmp_path), find_labels(tmp_path)
@@ -160,16 +130,6 @@ def test_kfgs_opens_the_scene(tmp_path):
     assert len(scene.points) == rooms.POINTS
     assert np.abs(away).mean() < rooms.POINT_NOISE
     assert not list(tmp_path.rglob("*.part"))
-
-
-def test_agreement_sees_a_wrong_pose(tmp_path):
-    poses = make_scene(tmp_path)
-    right, count = agreement(tmp_path, LENS, poses)
-    assert right == 1
-    assert count > 2000
-    shifted = np.array(Image.open(tmp_path / "labels" / "train_000.png"))
-    Image.fromarray(np.roll(shifted, 12, axis=1)).save(tmp_path / "labels" / "train_000.png")
-    assert agreement(tmp_path, LENS, poses)[0] < 0.995
 
 
 def test_things_name_every_shape():
@@ -191,9 +151,7 @@ def test_things_name_every_shape():
 
 def test_a_folder_without_a_scene_is_named(tmp_path, monkeypatch):
     monkeypatch.setattr("sys.argv", ["rooms.py", str(tmp_path), str(tmp_path / "out")])
-    with pytest.raises(
-        SystemExit, match="expected a scene folder with scene.xml, called one of dining-room, living-room"
-    ):
+    with pytest.raises(SystemExit, match="expected a scene folder with scene.xml, called one of dining-room"):
         rooms.main()
 
 
@@ -224,7 +182,5 @@ def test_a_room_is_rendered_and_continued(tmp_path, monkeypatch, capsys):
     assert capsys.readouterr().out.count(" of 14: ") == 1
     assert picture.read_bytes() == before
     assert len(load_scene(tmp_path).views("test")) == 1
-    poses = {stem: np.array(pose) for stem, pose in json.loads((tmp_path / "plan.json").read_text())["views"].items()}
-    assert agreement(tmp_path, Lens(64, 48, 0.65 * 64), poses)[0] > 0.99
     table = json.loads((tmp_path / "classes.json").read_text()).index("table")
     assert not (np.array(Image.open(tmp_path / "without" / "labels" / "test_000.png")) == table).any()

@@ -9,7 +9,7 @@ from messages import refused, tells
 
 from kfgs.evaluation.coco import load_coco_examples, load_coco_labels, save_coco
 from kfgs.evaluation.label_pictures import load_labels
-from kfgs.labels.run_lengths import decode_rle
+from kfgs.labels.classify import decode_rle
 
 
 def _coco(path: Path, **changes: object) -> Path:

@@ -6,14 +6,14 @@ from messages import refused
 
 from kfgs.gaussians import Gaussians
 from kfgs.labels import Recolor, Selection
-from kfgs.labels.color import parse_color
+from kfgs.labels.color import parse_color, shades
 
 WEIGHTS = torch.tensor([0.2126, 0.7152, 0.0722], dtype=torch.float64)
 C0 = 0.28209479177387814  # 1 / (2 sqrt(pi))
 
 
-def recolor(gaussians, mask, rgb, mode="tint"):
-    return Recolor(Selection.of(mask), rgb, mode).apply(gaussians)
+def recolor(gaussians, mask, rgb):
+    return Recolor(Selection.of(mask), rgb).apply(gaussians)
 
 
 def field(n=12, coefficients=4):
@@ -48,9 +48,9 @@ def greys(levels, opacities=None, sides=None):
     return Gaussians(means=ones, quats=torch.ones(n, 4), scales=scales, opacities=opacities.double(), sh=sh)
 
 
-def paint(gaussians, rgb, mode="tint"):
+def paint(gaussians, rgb):
     mask = torch.ones(len(gaussians), dtype=torch.bool)
-    return recolor(gaussians, mask, rgb, mode).sh[:, 0] * C0 + 0.5
+    return recolor(gaussians, mask, rgb).sh[:, 0] * C0 + 0.5
 
 
 def test_tint_makes_the_middle_the_colour_and_keeps_ratios():
@@ -85,23 +85,26 @@ def test_a_brighter_paint_stays_in_range_and_keeps_the_order():
 
 
 @pytest.mark.parametrize("rgb", ["#c04040", "#3060c0", "#000000", "#ffffff", "#777777", "#0000ff", "#ffff00"])
-def test_hue_keeps_every_luminance_from_every_direction(rgb):
+def test_luminance_follows_the_curve_from_every_direction(rgb):
+    """color(v) = T(L) + T'(L) (L(v) - L), with the curve of the object's own middle; and the rest stays."""
     gaussians = field(coefficients=16)
     mask, before = gaussians.labels == 0, gaussians.sh.clone()
-    painted = recolor(gaussians, mask, rgb, "hue")
+    painted = recolor(gaussians, mask, rgb)
     assert gaussians.sh.equal(before)
     assert painted.sh[~mask].equal(before[~mask])
     assert painted.opacities is gaussians.opacities
-    for basis in bases(16):
-        torch.testing.assert_close(
-            luminance(seen(painted.sh[mask], basis)), luminance(seen(gaussians.sh[mask], basis)), rtol=0, atol=1e-9
-        )
+    old, new = luminance(gaussians.sh[mask, 0] * C0 + 0.5), luminance(painted.sh[mask, 0] * C0 + 0.5)
+    shown = [[luminance(seen(sh[mask], basis)) for sh in (painted.sh, gaussians.sh)] for basis in bases(16)]
+    slopes = [(after - new) / (before - old) for after, before in shown]
+    torch.testing.assert_close(slopes, [slopes[0]] * len(slopes), rtol=1e-6, atol=1e-9)
 
 
-def test_hue_gives_shades_below_the_pure_colour_and_tints_above():
+def test_shades_below_the_pure_colour_and_tints_above():
     """Of luminance L the colour s * rgb, or between the brightest of its hue and white; worked by hand for (1, 0.5, 0)."""
     knee = 0.2126 + 0.5 * 0.7152
-    shown = paint(greys([knee / 2, knee, (1 + knee) / 2, 1.0]), [0.5, 0.25, 0.0], "hue")
+    rgb = torch.tensor([0.5, 0.25, 0.0], dtype=torch.float64)
+    tones = torch.tensor([knee / 2, knee, (1 + knee) / 2, 1.0], dtype=torch.float64)
+    shown = shades(tones, rgb, luminance(rgb))[0]  # a middle that stays: the tone is the luminance
     expected = [[0.5, 0.25, 0.0], [1.0, 0.5, 0.0], [1.0, 0.75, 0.5], [1.0, 1.0, 1.0]]
     torch.testing.assert_close(shown, torch.tensor(expected, dtype=torch.float64))
 

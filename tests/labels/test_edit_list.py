@@ -8,9 +8,8 @@ from messages import refused, tells
 
 from kfgs.cameras import Similarity
 from kfgs.formats import write_splats
-from kfgs.labels import Duplicate, EditList, Extract, Insert, Move, OfClass, Opacity, Recolor, Remove
+from kfgs.labels import Duplicate, EditList, Extract, InBox, Insert, Move, OfClass, Opacity, Recolor, Remove
 from kfgs.labels.edit_list import OPS
-from kfgs.labels.selection import InSphere
 
 ROTATION = torch.tensor([[0.6, -0.8, 0.0], [0.8, 0.6, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
 PLACE = Similarity(0.5, ROTATION, torch.tensor([1.0, 2.0, 3.0]))
@@ -25,9 +24,9 @@ def every_edit(folder):
     write_splats(scene(3, 1).replace(names=("vase", "wall", "chair")), folder / "parts" / "vase.ply")
     return EditList(
         [
-            Recolor(["plant", InSphere((0, 0, 0), 0.1)], "#c04040", "hue"),
+            Recolor(["plant", InBox((0, 0, 0), (0.1, 0.1, 0.1))], "#c04040"),
             Move("chair", (0, 0, 1), ("z", 30), 1.5, (0.5, 0.5, 0.5)),
-            Duplicate(OfClass("chair", 0, 10.0), (1, 0, 0), ((1.0, 0.0, 0.5), 20)),
+            Duplicate(OfClass("chair", 0), (1, 0, 0), ((1.0, 0.0, 0.5), 20)),
             Opacity("wall", 0.25),
             Remove("chair"),
             Insert(folder / "parts" / "vase.ply", PLACE),

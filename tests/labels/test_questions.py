@@ -82,7 +82,7 @@ def test_names_and_embeddings_of_classes_give_the_same_labels():
 
 def test_missing_negatives_are_named():
     bare = LabelSet(("wall",), FIVE[:1])
-    refused(lambda: field().query("wall", bare, negatives="classes"), "negatives:", "'wall'", "got none", "'canonical'")
+    refused(lambda: field().query("wall", bare, negatives="classes"), "negatives:", "'wall'", "got none", "'none'")
     with pytest.raises(ValueError, match=tells("negatives:", "got none", "`kfgs features --words`")):
         field().query("wall", bare, negatives="canonical")
     with pytest.raises(ValueError, match=tells("negatives:", "'auto', 'classes', 'canonical', 'none'", "got 'all'")):

@@ -5,7 +5,6 @@ import pytest
 import torch
 from messages import refused
 
-from kfgs.labels import relevancy
 from kfgs.labels.scores import similarity_threshold
 from kfgs.labels.selection import select_by_similarity
 
@@ -22,9 +21,9 @@ def test_relevancy_is_the_least_pairwise_softmax():
     generator = torch.Generator().manual_seed(3)
     similarity = torch.rand(50, generator=generator, dtype=torch.float64) * 2 - 1
     negatives = torch.rand(50, 4, generator=generator, dtype=torch.float64) * 2 - 1
-    np.testing.assert_allclose(relevancy(similarity, negatives), oracle(similarity, negatives), rtol=1e-12)
+    scores = select_by_similarity(similarity, negatives).scores
+    np.testing.assert_allclose(scores, oracle(similarity, negatives), rtol=1e-12)
     assert select_by_similarity(similarity).scores.equal(similarity)  # without negatives the cosine
-    assert select_by_similarity(similarity, negatives).scores.equal(relevancy(similarity, negatives))
     assert select_by_similarity(similarity, negatives, score="cosine").scores.equal(similarity)
 
 
@@ -45,8 +44,6 @@ def test_a_threshold_on_the_relevancy_is_strict():
 
 def test_wrong_input_is_named():
     similarity, negatives = torch.rand(3), torch.rand(3, 2)
-    refused(lambda: relevancy(torch.ones(3), torch.ones(3, 0)), "negatives:", "got none")
-    refused(lambda: relevancy(torch.ones(3), torch.ones(4, 1)), "negatives:", "[N, M]", "N = 3", "got (4, 1)")
     refused(lambda: select_by_similarity(torch.tensor([0.0, math.nan])), "similarity:", "got NaN", "row 1")
     refused(lambda: select_by_similarity(similarity, negatives, -0.5), "threshold:", "[0, 1]", "got -0.5")
     refused(lambda: select_by_similarity(similarity, threshold=1.5), "threshold:", "[-1, 1]", "got 1.5")

@@ -10,7 +10,7 @@ from messages import refused
 from oracles_selection import rotation
 
 from kfgs.labels import InBox, OfClass, OrientedBox, Selection
-from kfgs.labels.selection import KINDS, InSphere, OfIndex, read_object
+from kfgs.labels.selection import KINDS, OfIndex, read_object
 
 NAMES = ("wall", "Chair", "plant")
 
@@ -42,30 +42,30 @@ def test_a_part_of_a_class_is_the_largest_or_the_next():
     x = torch.tensor([0.0, 0.1, 0.2, 5.0, 5.1, 9.0])
     means = torch.stack([x, torch.zeros(6), torch.zeros(6)], dim=1)
     g = cloud(6).replace(means=means, labels=torch.tensor([1, 1, 1, 1, 1, 0]))
-    assert ask(OfClass(1, 0, 0.5), g) == [True, True, True, False, False, False]
-    assert ask(OfClass("chair", part=1, distance=0.5), g) == [False, False, False, True, True, False]
-    for rule, got in ((OfClass("chair", 2, 0.5), "1 to 2, got chair/3"), (OfClass(9, 0), ".* got 9, which none has")):
+    g = g.replace(extra={"instance": np.array([1, 1, 1, 2, 2, 1])})
+    assert ask(OfClass(1, 0), g) == [True, True, True, False, False, False]
+    assert ask(OfClass("chair", part=1), g) == [False, False, False, True, True, False]
+    for rule, got in ((OfClass("chair", 2), "1 to 2, got chair/3"), (OfClass(9, 0), ".* got 9, which none has")):
         with pytest.raises(ValueError, match=f"part: expected {got}"):
             rule.select(g)
     assert ask(OfIndex([2, 0, 2]), g) == [True, False, True, False, False, False]
     assert OfIndex([0, 2]) == OfIndex(torch.tensor([2, 0]))
 
 
-def test_box_and_sphere_against_loops_faces_included():
+def test_a_box_against_loops_faces_included():
     g, low, high = cloud(), (-1.0, -0.5, -2.0), (0.5, 1.5, 1.0)
     expected = [all(a <= x <= b for a, x, b in zip(low, p, high, strict=True)) for p in g.means.tolist()]
     assert 0 < sum(expected) < 60
     assert ask(InBox(low, high), g) == expected
-    assert ask(InSphere((0.5, 0, 0), 1.5), g) == [math.dist(p, (0.5, 0, 0)) <= 1.5 for p in g.means.tolist()]
     edge = cloud(2).replace(means=torch.tensor([[1.0, 0, 0], [1.0 + 1e-6, 0, 0]], dtype=torch.float64))
-    assert ask(InBox((-1, -1, -1), (1, 1, 1)), edge) == ask(InSphere((0, 0, 0), 1), edge) == [True, False]
+    assert ask(InBox((-1, -1, -1), (1, 1, 1)), edge) == [True, False]
     far = edge.replace(origin=(5e5, 0.0, 0.0))
-    assert ask(InBox((499999, -1, -1), (500001, 1, 1)), far) == ask(InSphere((5e5, 0, 0), 1), far) == [True, False]
+    assert ask(InBox((499999, -1, -1), (500001, 1, 1)), far) == [True, False]
 
 
 @pytest.mark.parametrize(
     "where",
-    [OfClass("plant"), OfClass(-1, 1, 0.5), InBox((0, 0, 0), (1, 1, 1)), InSphere((1, 2, 3), 0.25), OfIndex([3])],
+    [OfClass("plant"), OfClass(-1, 1), InBox((0, 0, 0), (1, 1, 1)), OfIndex([3])],
 )
 def test_json_there_and_back(where):
     again = read_object("where", json.loads(json.dumps(where.to_json(), allow_nan=False)), KINDS, "kind")
@@ -85,8 +85,6 @@ def test_json_there_and_back(where):
         ({"kind": "box", "min": [0, 0], "max": [1, 1, 1]}, ("where: min:", "3 numbers", "got [0, 0]")),
         ({"kind": "box", "min": [0, 0, float("nan")], "max": [1, 1, 1]}, ("where: min:", "got nan")),
         ({"kind": "box", "min": [0, 0, 2], "max": [1, 1, 1]}, ("where: max:", "min", "got (1.0, 1.0, 1.0)")),
-        ({"kind": "sphere", "center": [0, 0, 0], "radius": "1"}, ("where: radius:", "got '1'")),
-        ({"kind": "sphere", "center": [0, 0, 0], "radius": 0}, ("where: radius:", "got 0")),
         ({"kind": "index", "indices": [1.5]}, ("where: indices:", "got 1.5")),
         ({"kind": "index", "indices": 3}, ("where: indices:", "got 3")),
     ],
@@ -102,8 +100,8 @@ def test_what_the_cloud_lacks_is_named():
     refused(lambda: OfIndex([0, 60]).select(g), "indices:", "got 60")
     means = g.means.clone()
     means[1] = math.nan
-    for where in (InSphere([0, 0, 0], 1), InBox([0, 0, 0], [1, 1, 1])):
-        refused(lambda where=where: where.select(g.replace(means=means)), "gaussians.means:", "got NaN", "row 1")
+    box = InBox([0, 0, 0], [1, 1, 1])
+    refused(lambda: box.select(g.replace(means=means)), "gaussians.means:", "got NaN", "row 1")
 
 
 # Selections

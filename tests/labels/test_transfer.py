@@ -30,20 +30,6 @@ def test_agrees_with_the_oracle(distance):
     assert f"{result.orphaned} orphaned" in repr(result)
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_tie_goes_to_the_lowest_index_in_any_order(seed):
-    """12 sources, all exactly 5 away: more equals than are asked for."""
-    offsets = [(x, y, 0) for x in (-3, 3) for y in (-4, 4)] + [(x, 0, z) for x in (-3, 3) for z in (-4, 4)]
-    offsets += [(0, y, z) for y in (-3, 3) for z in (-4, 4)] + [(6, 0, 0)]
-    order = torch.randperm(13, generator=torch.Generator().manual_seed(seed))
-    src = torch.tensor(offsets, dtype=torch.float32)[order] + 10
-    result = nearest_labels(src, torch.arange(13), torch.full((1, 3), 10.0), 9.0)
-    lowest = next(i for i in range(13) if order[i] != 12)
-    assert (result.sources.tolist(), result.labels.tolist()) == ([lowest], [lowest])
-    assert result.distances.tolist() == [5.0]
-    assert nearest_labels(src, torch.arange(13), torch.full((1, 3), 10.0), 5.0).labels.tolist() == [-1]  # strict
-
-
 def test_many_sources_at_one_position_are_quick_and_the_first_labelled_one_counts():
     labels = torch.ones(20000, dtype=torch.int64)
     labels[0], labels[1] = -1, 2

@@ -109,8 +109,7 @@ def test_views_label_what_they_show_and_their_neighbours():
     assert attached.labels[-1] == -1
     assert attached.gaussians.scores[-1] == 0
     facts = attached.facts
-    assert facts["shown"] + facts["not shown"] == len(splats)
-    assert 0 < facts["not shown"] < 0.2 * len(splats)
+    assert 0.8 * len(splats) < facts["shown"] < len(splats)
 
 
 @pytest.mark.parametrize("by", ["distance", "views"])

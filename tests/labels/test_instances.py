@@ -1,0 +1,70 @@
+"""Things that views tell apart and distance does not."""
+
+import numpy as np
+import torch
+from cases_clouds import balls
+from messages import refused
+
+from kfgs import Camera, read_splats, write_splats
+from kfgs.labels import OfClass, Remove, connected_parts, number_instances, transfer_labels
+from kfgs.labels.components import number_parts
+
+NAMES = ("floor", "chair")
+
+
+def box(low, high, step=0.1):
+    return torch.cartesian_prod(*(torch.arange(a, b + 1e-6, step) for a, b in zip(low, high, strict=True)))
+
+
+def room():
+    """Two slabs that nearly touch, on a floor; and a leg beside the second."""
+    floor = box((-2.0, -2.0, 0.0), (2.0, 2.0, 0.0))
+    slabs = [box((-0.8, -0.3, 0.1), (-0.1, 0.3, 0.2)), box((0.1, -0.3, 0.1), (0.8, 0.3, 0.2))]
+    leg = box((0.9, 0.0, 0.1), (1.0, 0.1, 0.3))
+    truth = torch.cat([torch.full((len(part),), k) for k, part in enumerate([floor, *slabs, leg])])
+    return balls(torch.cat([floor, *slabs, leg]), truth > 0, scale=0.03, opacity=0.99, names=NAMES), truth
+
+
+def views(count=12):
+    angles = torch.arange(count) * 2 * torch.pi / count
+    places = torch.stack([2 * angles.cos(), 2 * angles.sin(), torch.full((count,), 4.0)], dim=1)
+    up = (0.0, 0.0, 1.0)
+    return [Camera.look_at(place, (0.0, 0.0, 0.5), up=up, width=200, height=150) for place in places]
+
+
+def test_views_part_what_distance_joins_and_a_leg_belongs_to_what_it_touches(tmp_path):
+    cloud, truth = room()
+    assert len(connected_parts(cloud, "chair", distance=0.25)) == 1
+    told = number_instances(cloud, views())
+    column = told.extra["instance"]
+    first, second = np.bincount(column[truth == 1]).argmax(), np.bincount(column[truth == 2]).argmax()
+    assert {first, second} == {1, 2}
+    assert (column[truth == 1] == first).mean() > 0.95
+    assert (column[(truth == 2) | (truth == 3)] == second).mean() > 0.95
+    assert len(connected_parts(told, "chair")) == 2
+    assert len(connected_parts(told, "chair", distance=1.0)) == 1  # a distance decides alone
+
+    write_splats(told, tmp_path / "told.ply")
+    again = Remove(OfClass("chair", 0)).apply(read_splats(tmp_path / "told.ply"))
+    assert [part.number for part in connected_parts(again, "chair")] == [2]  # it keeps its number
+    assert len(OfClass("chair", 1).select(again)) == int((column == 2).sum())
+    refused(lambda: OfClass("chair", 0).select(again), "part:", "[2]", "got chair/1")
+
+    splat = balls(cloud.means + 0.01)
+    np.testing.assert_array_equal(transfer_labels(told, splat, 0.05).extra["instance"], column)
+
+
+def test_things_of_several_classes_keep_apart():
+    cloud = balls(torch.randn(6, 3), [0, 0, 1, 1, 1, 0]).replace(extra={"instance": np.array([1, 1, 1, 2, 0, 2])})
+    everything = torch.ones(6, dtype=torch.bool)
+    numbers = number_parts(cloud, everything)
+    assert numbers[4] == -1
+    assert len(numbers.unique()) == 5
+    assert numbers[0] == numbers[1]
+    assert number_parts(cloud, cloud.labels == 1).tolist() == [-1, -1, 0, 1, -1, -1]
+
+
+def test_what_is_missing_is_named():
+    cloud = room()[0]
+    refused(lambda: number_instances(cloud, []), "cameras:", "got none", "connected_parts")
+    refused(lambda: number_instances(cloud.replace(labels=None), views(1)), "gaussians:", "labels")
