@@ -64,7 +64,8 @@ def radius_components(
 
 def cells(points: Array, size: float) -> tuple[Array, Array]:  # [n, 3] -> [n] int64, [S, 3]
     """Which cube of a grid each point lies in, numbered from 0, and the mean of the points in each cube."""
-    cell, count = np.unique(np.floor(points / size), axis=0, return_inverse=True, return_counts=True)[1:]
+    cubes = np.floor((points - points.min(axis=0, initial=np.inf)) / size)
+    cell, count = np.unique(cubes, axis=0, return_inverse=True, return_counts=True)[1:]
     cell = cell.ravel()
     sums = [np.bincount(cell, points[:, axis], len(count)) for axis in range(3)]
     return cell, np.stack(sums, axis=1) / count[:, None]

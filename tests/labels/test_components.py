@@ -23,7 +23,7 @@ def clumps(n, heaps, spread, seed):
 def test_the_same_parts_as_a_flood_fill(distance, seed):
     """What lies in one cube with edges of a quarter of the distance counts as one place, at its mean."""
     points = clumps(160, 12, (0.02, 0.2)[seed % 2], seed)
-    cubes = [tuple(cube) for cube in np.floor(points / (distance / 4))]
+    cubes = [tuple(cube) for cube in np.floor((points - points.min(axis=0)) / (distance / 4))]
     points = np.array([np.mean([p for p, c in zip(points, cubes, strict=True) if c == cube], axis=0) for cube in cubes])
     expected = oracle(points, distance)
     numbers = radius_components(points, distance)
