@@ -131,12 +131,13 @@ viz.plot_scores(answers["cosine"], run / "scores.png")
 Shown(run / "scores.png", width=560)
 
 # %% [markdown]
-# `connected_parts` takes the answer apart into single things. Each has a box, and the view that shows it best.
+# How many chairs are that? `field.instances` tells the things of a class apart, by what the training views show: two chairs
+# that touch are two pieces in most pictures. Each has a box, and the view that shows it best.
 
 # %%
-parts = kfgs.connected_parts(field, answers["relevancy"])
-for number, part in enumerate(parts, start=1):
-    print(f"{word} {number}: {part!r}")
+parts = field.instances(word)
+for part in parts:
+    print(f"{word} {part.number}: {part!r}")
 
 
 def draw(plotter):

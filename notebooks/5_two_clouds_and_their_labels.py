@@ -73,12 +73,12 @@ Image.fromarray(viz.picture_grid([row], titles, width=240, names=semantic.names)
 # renders and scores, `"points"` is quicker, and `"ellipsoids"` shows shapes.
 
 # %%
-from kfgs import OfClass, connected_parts
+from kfgs import OfClass
 
 cameras = field.cameras
-parts = connected_parts(semantic, thing, cameras)
-for number, part in enumerate(parts, start=1):
-    print(f"{thing} {number}: {len(part.indices)} Gaussians, best seen in {part.best_view.camera}")
+parts = field.instances(thing)  # told apart by what the views show
+for part in parts:
+    print(f"{thing} {part.number}: {len(part.indices)} Gaussians, best seen in {part.best_view.camera}")
 wall, ceiling = (OfClass(name).select(semantic) for name in ("wall", "ceiling"))
 inside = semantic[~(wall | ceiling)]  # to look into the room
 plotter = viz.make_plotter(480, 720)  # pv.Plotter, safe on machines without a display
