@@ -65,7 +65,7 @@ def number_instances(gaussians: Any, cameras: Sequence[Camera]) -> Gaussians:
             np.add.at(shown, cell[index[own]], shares[own][:, its])
             shown /= np.maximum(shown.sum(1), 1)[:, None]  # a view counts once, or less if it shows less than a pixel
             table += shown @ shown.T, np.outer(shown.sum(1), shown.sum(1))
-    numbers = np.zeros(len(labels), np.int32)  # as a PLY file can hold
+    numbers = np.zeros(len(labels), np.float32)  # as `class_id` in files: some importers skip no other columns
     for label, (centres, (together, seen)) in grids.items():
         own = labels == label
         part = largest_first(_join(together, seen, centres, np.bincount(cell[own]))[cell[own]])
