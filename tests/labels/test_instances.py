@@ -36,7 +36,7 @@ def test_views_part_what_distance_joins_and_a_leg_belongs_to_what_it_touches(tmp
     cloud, truth = room()
     assert len(connected_parts(cloud, "chair", distance=0.25)) == 1
     told = number_instances(cloud, views())
-    column = told.extra["instance"]
+    column = told.extra["instance"].astype(int)
     first, second = np.bincount(column[truth == 1]).argmax(), np.bincount(column[truth == 2]).argmax()
     assert {first, second} == {1, 2}
     assert (column[truth == 1] == first).mean() > 0.95
