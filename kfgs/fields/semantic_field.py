@@ -214,7 +214,8 @@ class SemanticField:
 
     def instances(self, name: str, cameras: Sequence[Camera] | None = None) -> list[Part]:
         """The things of a class ("the five chairs"), told apart by views, the field's by default (`labels.number_instances`)."""
-        return connected_parts(number_instances(self, cameras or self.cameras), self.query(name), cameras or self.cameras)
+        cameras = cameras or self.cameras
+        return connected_parts(number_instances(self, cameras), self.query(name), cameras)
 
     def segment(self, camera: Camera | str, classes: Classes | None = None) -> Tensor:  # [H, W] int64
         """The class of each pixel from a viewpoint, -1 for empty pixels; the rule is that of the decoder."""

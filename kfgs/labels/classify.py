@@ -132,6 +132,5 @@ def decode_rle(segmentation: dict[str, Any]) -> Tensor:  # [H, W] bool
         runs = segmentation if isinstance(counts, str) else coco.frPyObjects(segmentation, height, width)
         return torch.from_numpy(coco.decode(runs)).bool()
     except Exception as error:  # pycocotools raises bare exceptions
-        raise ValueError(
-            f"counts: expected runs that fill {size!r:.80} pixels, got {counts!r:.80} ({error})"
-        ) from error
+        got = f"{counts!r:.80} ({error})"
+        raise ValueError(f"counts: expected runs that fill {size!r:.80} pixels, got {got}") from error

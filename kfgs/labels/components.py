@@ -19,26 +19,27 @@ SPACINGS = 1.5  # the default distance in spacings of the selection: on room_0 2
 MOST_SPACINGS = 4.0  # ... and its bound in spacings of the cloud: a few specks across a room have a spacing of metres
 
 
-def part_distance(means: Tensor, mask: Tensor) -> float:  # [N, 3], [N] bool
+def part_distance(means: Tensor, mask: Tensor, whole: float = 0.0) -> float:  # [N, 3], [N] bool
     """The default distance of `number_parts`, in world units: 1.5 spacings of the masked Gaussians, at most 4 of all.
 
     It keeps a thing in one piece, and things apart. No constant does: on room_0 0.08 m joins two chairs and breaks a sofa.
     """
     points = positions("means", means)
-    own, whole = _spacing(points[mask.cpu().numpy()]), _spacing(points)
+    own, whole = spacing(points[mask.cpu().numpy()]), whole or spacing(points)
     return min(SPACINGS * own, MOST_SPACINGS * whole) or 1.0  # all at one position: any distance joins them
 
 
 def number_parts(gaussians: Gaussians, mask: Tensor, distance: float | None = None) -> Tensor:  # [N] int64
     """Number the parts of the Gaussians under a mask [N]; -1 lies outside it.
 
-    With a column `instance` and without a distance they are the things that it says, a number less 1: so the second chair
-    stays the second when the first is removed (things of several classes get numbers of their own). Otherwise two Gaussians
-    are connected if their means are at most `distance` apart, directly or through others under the mask; 0 is the largest.
+    With a column `instance` (whole numbers, 0 = none) and without a distance: the things that it says, a number less 1, so the
+    second chair stays the second when the first is removed (things of several classes get numbers of their own). Otherwise
+    two Gaussians are connected if their means are at most `distance` apart, directly or through others; 0 is the largest.
     """
-    column, labels = gaussians.extra.get(INSTANCE), gaussians.labels
-    if distance is None and column is not None and labels is not None and bool(mask.any()):
-        thing = torch.as_tensor(column, device=mask.device).long()
+    column, labels = np.asarray(gaussians.extra.get(INSTANCE, 0)), gaussians.labels
+    ours = column.min(initial=0) == 0 < column.max(initial=0) < 2**24 and (column % 1 == 0).all()
+    if distance is None and ours and labels is not None and bool(mask.any()):
+        thing = torch.from_numpy(column.astype(np.int64)).to(mask.device)
         numbers = thing - 1 + (labels - labels[mask].min()) * (thing.max() + 1)
         return numbers.masked_fill(~mask | (thing < 1), -1)
     points = positions("gaussians.means", gaussians.means)[mask.cpu().numpy()]
@@ -79,7 +80,7 @@ def largest_first(part: Array) -> Array:  # [n] -> [n] int64
     return rank[part]
 
 
-def _spacing(points: Array) -> float:
+def spacing(points: Array) -> float:
     """The distance within which 90 % of the positions have their fourth neighbour (the last, if fewer); 0 for one position."""
     places = np.unique(points, axis=0)
     if len(places) < 2:

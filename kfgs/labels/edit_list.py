@@ -19,7 +19,7 @@ from .._notes import tell
 from ..cameras.similarity import Similarity
 from ..formats.table import read_splats
 from ..gaussians import Gaussians
-from .edits import Duplicate, Edit, Extract, Move, Opacity, Recolor, Remove, transformed
+from .edits import Duplicate, Edit, Extract, Move, Opacity, Recolor, Remove, numbered_after, transformed
 from .selection import class_names, read_object, set_fields
 from .transfer import as_cloud
 
@@ -32,6 +32,7 @@ class Insert(Edit):
 
     The file is read when the edit is applied. All is drawn as the scene is, with or without antialiasing; harmonics of a
     lower degree are padded with zeros. What one of the two lacks is filled: labels with -1, scores and other columns with 0.
+    If the scene numbers its things (`number_instances`), what is inserted gets new numbers; if not, it has none either.
     """
 
     op: ClassVar[str] = "insert"
@@ -160,7 +161,7 @@ def join(first: Gaussians, second: Gaussians) -> Gaussians:
     if second.antialiased != first.antialiased:
         tell(f"what is inserted has antialiased={second.antialiased}; it is drawn as the scene: {first.antialiased}")
     labels, names = _in_classes_of(first, second)
-    second = second.replace(labels=labels, names=names, antialiased=first.antialiased)
+    second = numbered_after(first, second.replace(labels=labels, names=names, antialiased=first.antialiased))
     degrees = max(0 if cloud.sh is None else cloud.sh.shape[1] for cloud in (first, second))
     columns = {**first.extra, **second.extra}
 

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
+import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
@@ -21,7 +22,7 @@ from ..gaussians import Gaussians
 from ..splat.transform import transform_gaussians
 from .color import parse_color, recolor
 from .selection import Rule, Selection, as_rule, as_selection, class_names, plain_fields, set_fields, three_numbers
-from .transfer import as_cloud
+from .transfer import INSTANCE, as_cloud
 
 AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 HIDDEN = 1e-6  # an opacity that every renderer skips (alpha < 1/255) and every file can hold
@@ -195,12 +196,21 @@ class Move(_Motion):
 
 @dataclass(frozen=True)
 class Duplicate(_Motion):
-    """Add a copy of Gaussians, moved like `Move`, with labels and other columns. Copies come after the originals."""
+    """Add a copy of Gaussians, moved like `Move`, with labels and other columns, as new things, after the originals."""
 
     op: ClassVar[str] = "duplicate"
 
     def _change(self, gaussians: Gaussians, mask: Tensor) -> Gaussians:
-        return Gaussians.cat([gaussians, self.moved(gaussians.select(mask))])
+        return Gaussians.cat([gaussians, numbered_after(gaussians, self.moved(gaussians.select(mask)))])
+
+
+def numbered_after(first: Gaussians, second: Gaussians) -> Gaussians:
+    """The second cloud with new numbers for its things, as the first has some; if it has none, each class is one thing."""
+    extra = {**second.extra}
+    numbers = np.asarray(extra.pop(INSTANCE, np.ones(len(second), np.float32)))
+    if INSTANCE in first.extra:
+        extra[INSTANCE] = numbers + (numbers > 0) * np.max(first.extra[INSTANCE], initial=0)
+    return second.replace(extra=extra)
 
 
 def transformed(gaussians: Gaussians, similarity: Similarity, origin: Origin) -> Gaussians:

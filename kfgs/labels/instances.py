@@ -16,14 +16,13 @@ import torch
 from scipy.cluster.hierarchy import cophenet, linkage
 from scipy.spatial.distance import pdist, squareform
 from skimage.measure import label as connected_pixels
-from torch.nn.functional import one_hot
 
 from .._arrays import Array
 from ..cameras import Camera
 from ..gaussians import Gaussians
 from ..splat.rasterize import rasterize
 from ..splat.views import sum_pixels
-from .components import SPECK, cells, largest_first, part_distance
+from .components import SPECK, cells, largest_first, part_distance, spacing
 from .transfer import INSTANCE, as_cloud, positions
 
 SIDE, VIEWS = 200, 30  # pixels of a view's longer side, and how many views are compared
@@ -43,21 +42,21 @@ def number_instances(gaussians: Any, cameras: Sequence[Camera]) -> Gaussians:
             if there is none.
     """
     cloud = as_cloud(gaussians, labelled=True)
-    if not cameras:
+    if not (cameras := getattr(cameras, "cameras", cameras)):
         raise ValueError("cameras: expected at least one view, got none; connected_parts goes by distance alone")
     assert cloud.labels is not None
     labels, means = cloud.labels.cpu().numpy(), positions("gaussians.means", cloud.means)
-    cell, grids = np.zeros(len(labels), np.int64), {}
+    cell, grids, whole = np.zeros(len(labels), np.int64), {}, spacing(means)
     for label in np.unique(labels[labels >= 0]).tolist():
-        size, own = part_distance(cloud.means, cloud.labels == label), labels == label
+        size, own = part_distance(cloud.means, cloud.labels == label, whole), labels == label
         while len((grid := cells(means[own], size))[1]) > CELLS:
             size *= 1.25
         cell[own], centres = grid
         grids[label] = centres / size, np.zeros((2, len(centres), len(centres)))
-    for camera in (camera.fitted(SIDE) for camera in cameras[:: -(-len(cameras) // VIEWS)]):
+    for camera in (camera.fitted(SIDE) for camera in cameras[:: -(-len(cameras) // VIEWS)] if grids):
         kind, piece = _pieces(cloud, camera)
         names, first, piece = np.unique(piece, return_index=True, return_inverse=True)
-        signal = one_hot(torch.from_numpy(piece).reshape(camera.size))[..., names > 0].to(cloud.means)
+        signal = torch.eye(len(names)).to(cloud.means)[torch.from_numpy(piece).reshape(camera.size)][..., names > 0]
         index, shares, _ = (part.cpu().numpy() for part in sum_pixels(cloud, camera, signal))
         for label, (_, table) in grids.items():
             own, its = labels[index] == label, kind.ravel()[first[names > 0]] == label
@@ -78,7 +77,7 @@ def _pieces(cloud: Gaussians, camera: Camera) -> tuple[Array, Array]:  # [H, W],
     """The class of each pixel, and its piece: connected pixels of one class without a jump in depth; 0 = none, too small."""
     assert cloud.labels is not None
     present, place = cloud.labels.unique(return_inverse=True)
-    shown = rasterize(cloud.replace(features=one_hot(place).to(cloud.means)), camera)
+    shown = rasterize(cloud.replace(features=torch.eye(len(present)).to(cloud.means)[place]), camera)
     kind = present[shown.map.argmax(-1)].masked_fill(shown.alpha < 0.5, -1).cpu().numpy()
     steps = np.log(shown.depth.clamp(min=1e-9).cpu().numpy())
     down, right = (np.abs(np.diff(steps, axis=axis)) > JUMP for axis in (0, 1))
@@ -92,9 +91,8 @@ def _join(together: Array, seen: Array, centres: Array, count: Array) -> Array: 
     number, near = np.arange(len(count)), np.ones((len(count),) * 2)
     if len(count) > 1:  # 1: connected by gaps of one cell; 0: by none below two
         near = np.clip(2 - squareform(cophenet(linkage(centres, "single"))), 0, 1)
-    once = np.outer(
-        *[np.clip(seen.diagonal(), 1e-9, 1)] * 2
-    )  # that two are near counts as one more view; of those that
+    own = np.clip(seen.diagonal(), 1e-9, 1)
+    once = np.outer(own, own)  # that two are near counts as one more view; of those that
     together = together + (near - 1e-6 * squareform(pdist(centres))) * once  # no view shows, the nearest are joined
     seen, touch, count = seen + once, near == 1, count.astype(float)
     while True:

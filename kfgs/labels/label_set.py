@@ -125,9 +125,8 @@ def load_label_set(classes: str | Path, embeddings: str | Path | None = None) ->
         return _read_table(path).select(names)
     rows = read_array(path, "an .npy file of numbers, one embedding row per class")
     if rows.ndim != 2 or rows.dtype.kind != "f" or len(rows) != len(names) or not np.isfinite(rows).all():
-        raise ValueError(
-            f"{path}: expected finite floats [C, D] with C = {len(names)} (from {classes}), got {rows.dtype} {rows.shape}"
-        )
+        got = f"C = {len(names)} (from {classes}), got {rows.dtype} {rows.shape}"
+        raise ValueError(f"{path}: expected finite floats [C, D] with {got}")
     with reading(classes, "a JSON list of different class names", "correct the list"):
         return LabelSet(tuple(names), torch.from_numpy(rows.astype(np.float32)))
 
@@ -212,11 +211,8 @@ def make_question(
         check_choice("negatives", negatives, get_args(Negatives))
         against = rows[:0]
     if len(against) == 0 and negatives in ("classes", "canonical"):
-        what = (
-            f"classes than {words!r}"
-            if negatives == "classes"
-            else "canonical words (`kfgs features --words` adds some)"
-        )
+        what = f"classes than {words!r}" if negatives == "classes" else "canonical words"
+        what += " (`kfgs features --words` adds some)" * (negatives == "canonical")
         raise ValueError(f"negatives: expected other {what}, got none; use another, or 'none'")
     return torch.cat([row[None], against.to(row)])
 

@@ -102,9 +102,8 @@ class Part:
         place = ", ".join(say_coordinate(x, 3) for x in self.centroid.tolist())
         size = " x ".join(f"{2 * x:.3g}" for x in self.box.half.tolist())
         view = "" if self.best_view is None else f", {self.best_view.share:.1%} of {self.best_view.camera!r}"
-        return (
-            f"Part({self.count} Gaussian{'s' * (self.count != 1)} at ({place}), {size}, score {self.score:.3f}{view})"
-        )
+        what = f"{self.count} Gaussian{'s' * (self.count != 1)} at ({place})"
+        return f"Part({what}, {size}, score {self.score:.3f}{view})"
 
     def to_json(self) -> dict[str, Any]:
         """Plain numbers, lists and strings."""
@@ -144,7 +143,7 @@ def connected_parts(
         smallest: parts with fewer Gaussians are left out; None: those below 5 % of the largest.
         most: the most parts to return.
     """
-    gaussians = as_cloud(gaussians)
+    gaussians, cameras = as_cloud(gaussians), getattr(cameras, "cameras", cameras)
     selection = as_selection(selection, gaussians)
     check_shapes(("gaussians.means", gaussians.means, "N 3"), ("selection.mask", selection.mask, "N"))
     check_whole("most", most, 1)
@@ -163,10 +162,8 @@ def connected_parts(
     shares = torch.stack([rasterize(shown, view).map.mean(dim=(0, 1)) for view in views] or [torch.zeros(len(kept))])
     for i, indices in enumerate(members):
         points = to_world(gaussians.means[indices].detach().double(), gaussians.origin)
-        view = None
-        if cameras and bool((shares[:, i] > 0).any()):
-            best = int(shares[:, i].argmax())
-            view = BestView(cameras[best].name, best, float(shares[best, i]))
+        share, best = float(shares[:, i].max()), int(shares[:, i].argmax())
+        view = BestView(cameras[best].name, best, share) if cameras and share > 0 else None
         score, extent = float(selection.scores[indices].double().mean()), (points.amin(dim=0), points.amax(dim=0))
         place, box = points.mean(dim=0), OrientedBox.around(points)
         how = f"{selection.how}; part {i + 1} of {len(sizes)}"

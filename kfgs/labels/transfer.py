@@ -51,10 +51,8 @@ class Transfer:
         return (1 - self.distances / (self.distance or 1.0)).clamp_min(0.0)
 
     def __repr__(self) -> str:
-        return (
-            f"Transfer({self.labelled:,} of {len(self.labels):,} labelled (nearest within {self.distance:.4g}), "
-            f"{self.orphaned:,} orphaned; lambda: {self.how})"
-        )
+        labelled = f"{self.labelled:,} of {len(self.labels):,} labelled (nearest within {self.distance:.4g})"
+        return f"Transfer({labelled}, {self.orphaned:,} orphaned; lambda: {self.how})"
 
 
 def transfer_labels(source: Any, target: Gaussians, distance: float | None = None) -> Gaussians:
@@ -75,8 +73,10 @@ def transfer_labels(source: Any, target: Gaussians, distance: float | None = Non
     source, target = as_cloud(source, "source", labelled=True), as_cloud(target, "target")
     places = recounted(target.means, target.origin, source.origin)
     carried = nearest_labels(source.means, source.labels, places, distance)
-    things = {INSTANCE: np.append(source.extra[INSTANCE], 0)[carried.sources.cpu()]} if INSTANCE in source.extra else {}
-    scores, extra = carried.scores.to(target.means.dtype), {**target.extra, **things}
+    extra = {name: column for name, column in target.extra.items() if name != INSTANCE}  # it numbers the old labels
+    if INSTANCE in source.extra:
+        extra[INSTANCE] = np.pad(source.extra[INSTANCE], (0, 1))[carried.sources.cpu()]
+    scores = carried.scores.to(target.means.dtype)
     return target.replace(labels=carried.labels, scores=scores, names=source.names, extra=extra)
 
 
@@ -161,10 +161,8 @@ class Sources:
             spacings = np.asarray(self.tree.query(sampled(np.asarray(self.tree.data)), k=2, workers=-1)[0])[:, 1]
             usual, wide = (float(spacing) for spacing in np.quantile(spacings, [0.5, WIDE]))
         chosen = min(max(reach, NEAREST * usual), FARTHEST * wide)
-        return max(chosen, tiny), (
-            f"{100 * COVERAGE:g} % of the destinations have a source within {reach:.3g}; the sources' spacings are "
-            f"{usual:.3g} (median) and {wide:.3g} ({100 * WIDE:g} % are smaller)"
-        )
+        how = f"{100 * COVERAGE:g} % of the destinations have a source within {reach:.3g}; the sources' spacings are"
+        return max(chosen, tiny), f"{how} {usual:.3g} (median) and {wide:.3g} ({100 * WIDE:g} % are smaller)"
 
 
 def as_cloud(value: Any, name: str = "gaussians", *, labelled: bool = False) -> Gaussians:

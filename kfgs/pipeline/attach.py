@@ -23,6 +23,7 @@ from ..formats.ply_3dgs import label_column
 from ..formats.sidecar import write_names
 from ..gaussians import Gaussians
 from ..labels import LabelSet, Transfer, nearest_labels, number_instances
+from ..labels.transfer import INSTANCE
 from ..scenes import SceneError, align_by_cameras, frames_agree
 from ..scenes.frames import Alignment
 from ..splat import transform_gaussians, vote_labels
@@ -151,7 +152,8 @@ def attach(
         who = "that no view shows" if ways else "got a class"
         ways.append(f"{transfer.labelled:,} {who} by distance (lambda {transfer.distance:.3g})")
     note = f"{how['labelled by']}: of {len(splats):,} Gaussians {', '.join(ways)}, {transfer.orphaned:,} got none"
-    labelled = splats.replace(labels=labels, scores=scores.float(), names=semantic.names)
+    extra = {name: column for name, column in splats.extra.items() if name != INSTANCE}  # it numbers the old labels
+    labelled = splats.replace(labels=labels, scores=scores.float(), names=semantic.names, extra=extra)
     if cameras:
         labelled = number_instances(labelled, [similarity.apply_to_camera(camera) for camera in cameras])
     return Attached(labelled, transfer, similarity, alignment, (frame_note, note), facts)
@@ -218,10 +220,8 @@ def label_cloud(
     cloud, out = as_path(cloud), check_suffix(out, ".ply", name="out")
     columns, header = read_ply(cloud), read_header(cloud)
     if others := [element.name for element in header.elements[1:] if element.rows]:  # for instance the faces of a mesh
-        raise ValueError(
-            f"{cloud}: expected nothing but points, got {', '.join(others)} too, which labelling would lose; save the "
-            "vertices as a point cloud"
-        )
+        got = f"{', '.join(others)} too, which labelling would lose; save the vertices as a point cloud"
+        raise ValueError(f"{cloud}: expected nothing but points, got {got}")
     local = recounted(points_from_columns(cloud, columns), ORIGIN, gaussians.origin)
     moved = nearest_labels(gaussians.means, gaussians.labels, local, distance)
     added = {"class_id": label_column(moved.labels)}

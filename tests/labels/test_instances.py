@@ -6,8 +6,9 @@ from cases_clouds import balls
 from messages import refused
 
 from kfgs import Camera, read_splats, write_splats
-from kfgs.labels import OfClass, Remove, connected_parts, number_instances, transfer_labels
+from kfgs.labels import Duplicate, OfClass, Remove, connected_parts, number_instances, transfer_labels
 from kfgs.labels.components import number_parts
+from kfgs.labels.edit_list import join
 
 NAMES = ("floor", "chair")
 
@@ -28,8 +29,7 @@ def room():
 def views(count=12):
     angles = torch.arange(count) * 2 * torch.pi / count
     places = torch.stack([2 * angles.cos(), 2 * angles.sin(), torch.full((count,), 4.0)], dim=1)
-    up = (0.0, 0.0, 1.0)
-    return [Camera.look_at(place, (0.0, 0.0, 0.5), up=up, width=200, height=150) for place in places]
+    return [Camera.look_at(place, (0.0, 0.0, 0.5), up=(0, 0, 1), width=200, height=150) for place in places]
 
 
 def test_views_part_what_distance_joins_and_a_leg_belongs_to_what_it_touches(tmp_path):
@@ -49,22 +49,25 @@ def test_views_part_what_distance_joins_and_a_leg_belongs_to_what_it_touches(tmp
     assert [part.number for part in connected_parts(again, "chair")] == [2]  # it keeps its number
     assert len(OfClass("chair", 1).select(again)) == int((column == 2).sum())
     refused(lambda: OfClass("chair", 0).select(again), "part:", "[2]", "got chair/1")
-
-    splat = balls(cloud.means + 0.01)
-    np.testing.assert_array_equal(transfer_labels(told, splat, 0.05).extra["instance"], column)
+    assert len(connected_parts(Duplicate("chair", (0, 0, 9)).apply(told), "chair")) == 4  # a copy is a new thing
+    assert len(connected_parts(join(told, cloud), "chair")) == 3  # without numbers: one thing of its class
+    assert join(told, cloud).extra["instance"].dtype == np.float32
+    assert not join(cloud, told).extra
+    carried = transfer_labels(told, balls(cloud.means + 0.01), 0.05)
+    np.testing.assert_array_equal(carried.extra["instance"], told.extra["instance"], strict=True)  # type too
+    assert not transfer_labels(cloud, carried).extra  # old numbers go with the old labels
 
 
 def test_things_of_several_classes_keep_apart():
     cloud = balls(torch.randn(6, 3), [0, 0, 1, 1, 1, 0]).replace(extra={"instance": np.array([1, 1, 1, 2, 0, 2])})
-    everything = torch.ones(6, dtype=torch.bool)
-    numbers = number_parts(cloud, everything)
-    assert numbers[4] == -1
-    assert len(numbers.unique()) == 5
-    assert numbers[0] == numbers[1]
+    assert number_parts(cloud, torch.ones(6) > 0).tolist() == [0, 0, 3, 4, -1, 1]
     assert number_parts(cloud, cloud.labels == 1).tolist() == [-1, -1, 0, 1, -1, -1]
+    for foreign in ([0.5] * 6, [0, 1, -1, 1, 0, 1], [np.nan] * 6, [0] * 6, [10**17, 0, 1, 1, 1, 1]):
+        assert int(number_parts(cloud.replace(extra={"instance": foreign}), torch.ones(6) > 0).min()) == 0
 
 
 def test_what_is_missing_is_named():
     cloud = room()[0]
     refused(lambda: number_instances(cloud, []), "cameras:", "got none", "connected_parts")
-    refused(lambda: number_instances(cloud.replace(labels=None), views(1)), "gaussians:", "labels")
+    refused(lambda: number_instances(cloud.replace(labels=None), views(1)[0]), "gaussians:", "labels")
+    assert len(number_instances(cloud[:0], views(1)[0])) == 0
