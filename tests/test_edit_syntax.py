@@ -12,7 +12,7 @@ def read(**words):
 
 
 def test_each_option_is_the_edit_it_says():
-    assert read(recolor=["plant:#ff0080"]) == [Recolor(OfClass("plant"), (1.0, 0.0, 128 / 255), "tint")]
+    assert read(recolor=["plant:#ff0080"]) == [Recolor(OfClass("plant"), (1.0, 0.0, 128 / 255))]
     assert read(move=["table:0.5,0,-2e-1"]) == [Move(OfClass("table"), (0.5, 0.0, -0.2))]
     assert read(remove=["window blind", "chair"]) == [Remove(OfClass("window blind")), Remove(OfClass("chair"))]
     assert read(extract=["rug", "sofa"]) == [Extract([OfClass("rug"), OfClass("sofa")])]
@@ -44,7 +44,7 @@ def test_a_class_asked_in_other_case_is_removed_with_it():
 
 def test_a_number_behind_a_class_is_a_part_of_it():
     second = OfClass("chair", 1)
-    assert read(recolor=["chair/2:red"]) == [Recolor(second, (1.0, 0.0, 0.0), "tint")]
+    assert read(recolor=["chair/2:red"]) == [Recolor(second, (1.0, 0.0, 0.0))]
     assert read(move=["chair/2:0.5,0,0"]) == [Move(second, (0.5, 0.0, 0.0))]
     assert read(extract=["chair/2", "rug"]) == [Extract([second, OfClass("rug")])]
     assert read(remove=["chair/2"]) == [Remove(second)]

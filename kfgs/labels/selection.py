@@ -306,10 +306,8 @@ def plain_fields(value: Any) -> dict[str, Any]:
 def _plain(value: Any) -> Any:
     if isinstance(value, tuple):
         return [_plain(part) for part in value]
-    if isinstance(value, Rule):
-        return value.to_json()
-    if isinstance(value, Similarity):
-        return value.matrix().tolist()
+    if isinstance(value, Rule | Similarity):
+        return value.to_json() if isinstance(value, Rule) else value.matrix().tolist()
     return str(value) if isinstance(value, Path) else value
 
 
@@ -319,6 +317,7 @@ def read_object(name: str, value: Any, kinds: Mapping[str, type[T]], tag: str) -
     if not isinstance(kind, str) or kind not in kinds:
         raise ValueError(f"{name}: expected an object whose {tag!r} is one of {', '.join(kinds)}, got {value!r:.80}")
     try:
-        return kinds[kind](**{key: part for key, part in value.items() if key != tag})
+        own = {key: part for key, part in value.items() if key != tag and (key, part) != ("mode", "tint")}
+        return kinds[kind](**own)  # older files name this mode of Recolor, the only one there is now
     except (TypeError, ValueError, OverflowError) as error:
         raise ValueError(f"{name}: {error}") from error

@@ -196,7 +196,7 @@ function shift({ meta, means, splats }, rows, translation) {
   }
 }
 
-/** Give Gaussians one hue and keep their shading: `Recolor` of kfgs, in its mode "tint". */
+/** Give Gaussians one hue and keep their shading: `Recolor` of kfgs. */
 function paint(cloud, rows, rgb) {
   const [low, step] = cloud.meta.dc;
   const colors = Array.from(rows, (i) => [0, 10, 20].map((bits) => low + step * ((cloud.dc[i] >>> bits) & 1023)));

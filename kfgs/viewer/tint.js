@@ -1,4 +1,4 @@
-/** Recolouring with the shading kept: what kfgs.labels.recolor computes in its mode "tint" (kfgs/labels/color.py). */
+/** Recolouring with the shading kept: what kfgs.labels.recolor computes (kfgs/labels/color.py). */
 
 const WEIGHTS = [0.2126, 0.7152, 0.0722]; // Rec. 709
 const DARK = 1 / 255;

@@ -76,7 +76,7 @@ def test_saved_and_replayed(tmp_path):
 def test_hand_written_json_may_be_short_and_names_a_missing_file(tmp_path):
     path = tmp_path / "edits.json"
     edits = [
-        {"op": "recolor", "where": "plant", "rgb": "#c04040"},
+        {"op": "recolor", "where": "plant", "rgb": "#c04040", "mode": "tint"},
         {"op": "move", "where": {"kind": "class", "name": "chair"}, "rotation": ["z", 90]},
     ]
     path.write_text(json.dumps({"format": "kfgs.edits", "version": 1, "edits": edits}))
