@@ -74,9 +74,9 @@ class PageServer(AbstractContextManager["PageServer"]):
         """Serve one more page, and no longer the first of those that were added if they are too many; returns its secret."""
         secret = secrets.token_urlsafe(24)
         files = {"": ("text/html; charset=utf-8", document.encode()), "pack": ("application/octet-stream", pack)}
-        if len(self.scenes) == MOST_SCENES:
-            del self.scenes[list(self.scenes)[1]]
         self.scenes[secret] = files, partial(self._call, call)
+        for old in list(self.scenes)[1 : 1 - MOST_SCENES]:  # several, if files are dropped at the same time
+            self.scenes.pop(old, None)
         return secret
 
     def _call(self, own: Call, name: str, args: dict[str, Any], attached: bytes) -> tuple[dict[str, Any], bytes]:

@@ -118,6 +118,9 @@ def test_pages_of_files_are_few_and_local():
         assert [status for status, _ in found] == [200, 403, 403, 200, 200, 200]
         assert [content for _, content in found[3:]] == [b"\2", b"\3", b"\4"]
         assert ask(server, f"/{opened[4]}/")[1] == b"page 4"
+        server.scenes |= dict.fromkeys("abc", server.scenes[server.secret])  # as if all came at the same time
+        call(server, "open", {"name": "x"})
+        assert len(server.scenes) == 4
     with PageServer(PAGE, PACK, answer, "0.0.0.0", open_file=made) as other:
         assert "only this machine can open" in call(other, "open", {"name": "x"})[0]["error"]
 
