@@ -151,11 +151,10 @@ class Shared(HasTraits):
             known = state.meaning.names
             labels = [(-1,) if word == state.class_name(-1) else class_indices(word, known) for word in words]
             return {"hidden": sorted({label for own in labels for label in own})}
-        if name == "picked":
-            if value is None or isinstance(value, Picked):
-                return {"picked": value and {"side": value.side, "index": value.index}}
-            check_whole("picked", value, 0, len(state.cloud(self.side)) - 1)
-            return {"picked": {"side": self.side, "index": int(value)}}
+        if name == "picked" and value is not None:
+            side, index = (value.side, value.index) if isinstance(value, Picked) else (self.side, value)
+            check_whole("picked", index, 0, len(state.cloud(side)) - 1)
+            return {"picked": {"side": side, "index": int(index)}}
         if name == "tape":
             ends = torch.zeros(0, 3) if value is None else torch.from_numpy(as_array(value, "tape").astype(np.float64))
             check_shapes(("tape", ends, ("N" if value is None else 2, 3)))

@@ -31,14 +31,14 @@ def pack_thing(thing: Any, color: Any, origin: Origin) -> dict[str, Any]:
         return {"marks": [recounted(own.cpu(), ORIGIN, origin).tolist() for own in corners]}
     faces, own = np.zeros((0, 3)), None
     if hasattr(thing, "faces") and hasattr(thing, "point_data"):  # of pyvista; points alone have no faces
-        own = next((thing.point_data[name] for name in COLORED if name in thing.point_data), None)
+        own = next((own for name in COLORED if np.ndim(own := thing.point_data.get(name)) == 2), None)
         thing, faces = thing.points, thing.triangulate().faces.reshape(-1, 4)[:, 1:]
     elif hasattr(thing, "faces") and hasattr(thing, "vertices"):  # of trimesh, for instance
         own = getattr(getattr(thing, "visual", None), "vertex_colors", None)  # trimesh: opaque grey by default
         thing, faces = thing.vertices, as_array(thing.faces, "thing.faces")
     places = torch.from_numpy(as_array(thing, "thing").astype(np.float64))
     check_shapes(("thing", places, "3" if places.ndim == 1 else "N 3"), ("thing.faces", faces, "F 3"))
-    check_finite("thing", places)
+    check_finite("thing", places.float())  # as the browser has them
     if faces.size:
         for corner in (faces.min(), faces.max()):
             check_range("thing.faces", corner, 0, len(places) - 1)

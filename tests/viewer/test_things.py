@@ -48,6 +48,7 @@ def test_points_have_one_colour_or_one_each(viewer):
 def test_meshes_are_those_of_pyvista_and_trimesh(viewer):
     trimesh = pytest.importorskip("trimesh")
     plain, painted, grey = pyvista.Cube(), pyvista.Cube(), trimesh.creation.box((1, 1, 1))
+    plain["colors"] = np.arange(plain.n_points)  # numbers are no colours
     painted["rgb"] = np.full((painted.n_points, 3), 7, np.uint8)
     for thing, color in ((plain, (61, 139, 255)), (painted, 7), (grey, 102)):
         viewer.add("cube", thing)
@@ -73,6 +74,7 @@ def test_boxes_and_labels_are_marks_in_the_frame_of_the_scene():
     [
         ([[0, 1]], None, ["thing:", "[N, 3]", "(1, 2)"]),
         ([[0, 1, np.nan]], None, ["thing:", "NaN"]),
+        ([[0, 1, 1e39]], None, ["thing:", "infinity"]),
         ("room.ply", None, ["thing:", "str"]),
         (CORNERS, "reddish", ["color:", "'reddish'"]),
         (CORNERS, [[0, 0, 0]], ["color:", "N = 3", "(1, 3)"]),
@@ -108,9 +110,8 @@ def test_a_mesh_is_hidden_by_gaussians_in_front_and_hides_those_behind(browser, 
     green = 0 if deep < 4 else before[inside][..., 1]
     np.testing.assert_allclose(after[inside][..., 1], green, atol=2 / 255)
     assert after[inside][..., 2].max() <= 1 / 255  # the blue wall is behind it
-    np.testing.assert_allclose(
-        after[inside][..., 0], 1 - np.asarray(green), atol=0.01
-    )  # what the green wall lets through
+    red = 1 - np.asarray(green)  # what the green wall lets through
+    np.testing.assert_allclose(after[inside][..., 0], red, atol=0.01)
     shown.run("() => renderer.setSolids([])")
     np.testing.assert_array_equal(shown.picture(CAMERA, "semantic"), before)
     assert shown.errors == []

@@ -98,9 +98,8 @@ def test_a_broken_gaussian_is_not_drawn_and_changes_no_gradient(broken, channels
     projected = projected._replace(**{name: values})
     everyone = _everywhere(M + 1, width, height, 16)
     whole = everyone.rows.view(-1, M + 1)
-    others = Tiles(
-        whole[whole != 7].contiguous(), M * torch.arange(len(everyone.offsets)), width, height, 16
-    )  # without the broken one
+    rows = whole[whole != 7].contiguous()  # without the broken one
+    others = Tiles(rows, M * torch.arange(len(everyone.offsets)), width, height, 16)
     expected = _gradients(projected, features, width, height, others)
     actual = _gradients(projected, features, width, height, everyone)
     for i, (a, b) in enumerate(zip(actual, expected, strict=True)):
