@@ -92,7 +92,7 @@ class App {
     await this.panes.settled(true);
     this.loading.remove();
     this.root.removeAttribute("aria-busy");
-    this.stage.focus({ preventScroll: true });
+    if (this.alone) this.stage.focus({ preventScroll: true });
   }
 
   /** Show what Python showed: mode, question, gamma. */
@@ -133,9 +133,9 @@ class App {
     };
   }
 
-  /** Whether the page is the viewer's own. */
+  /** Whether the page is the viewer's own, and not in a frame of another, which keeps its keys and scrolls. */
   get alone() {
-    return this.root.parentElement === document.body;
+    return this.root.parentElement === document.body && window === parent;
   }
 
   /** Resolves when the picture is that of the state. */

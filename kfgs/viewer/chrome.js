@@ -135,15 +135,16 @@ export function makeViews(app) {
   });
   const scroll = (event) => (event.currentTarget.scrollLeft += event.deltaY);
   const group = { class: "views card", role: "group", "aria-label": "The scene's views", hidden: !buttons.length, onwheel: scroll };
+  const element = h("div", group, ...buttons);
   const set = (at) => {
     buttons.forEach((button, own) => {
       button.setAttribute("aria-current", String(own === at));
       button.tabIndex = own === (at ?? 0) ? 0 : -1;
     });
-    buttons[at]?.scrollIntoView({ block: "nearest", inline: "nearest" });
+    if (buttons[at]) element.scrollLeft = buttons[at].offsetLeft - element.offsetLeft - element.offsetWidth / 2; // alone: not the page
   };
   set(null);
-  return { element: h("div", group, ...buttons), set };
+  return { element, set };
 }
 
 /** The photo of a view over the scene, with its opacity. Returns {elements, show(url)}. */

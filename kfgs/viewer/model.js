@@ -246,7 +246,7 @@ export class Model extends EventTarget {
 
   /** Give the selected Gaussians a colour, [r, g, b] in 0..1, and keep their shading. Returns how many. */
   recolor(rgb) {
-    return this.edit("recolor", { rgb, mode: "tint" });
+    return this.edit("recolor", { rgb });
   }
 
   /** Multiply the opacity of the selected Gaussians by a factor, 0..1; again, while they are selected, replaces it. */
@@ -424,10 +424,10 @@ export class Model extends EventTarget {
 
   /** Take over what is no step of undo: hidden classes, the side shown, the picked Gaussian, the tape, lambda. */
   arrange({ hidden, side, picked, tape, lambda }) {
-    this.hidden = new Set(hidden);
+    this.hidden = new Set([hidden ?? []].flat());
     if (this.sides.includes(side)) this.side = side;
-    this.picked = picked ?? null;
-    this.tape = tape ?? [];
+    this.picked = this.sides.includes(picked?.side) ? picked : null;
+    this.tape = [tape ?? []].flat().filter((place) => place?.length === 3 && place.every?.(Number.isFinite));
     this.setLambda(Number(lambda ?? this.lambda));
   }
 
@@ -548,11 +548,11 @@ function maskOf(saved, count) {
 }
 
 /** Whether an edit that was read can be done to these Gaussians of so many. */
-function possible({ op, factor, rgb, mode, translation }, rows, count) {
+function possible({ op, factor, rgb, translation }, rows, count) {
   const within = (values, low, high) => Array.isArray(values) && values.every((one) => Number.isFinite(one) && one >= low && one <= high);
   const vector = (values, low, high) => within(values, low, high) && values.length === 3;
   const values = {
-    remove: () => true, opacity: () => within([factor], 0, 1), recolor: () => vector(rgb, 0, 1) && mode === "tint",
+    remove: () => true, opacity: () => within([factor], 0, 1), recolor: () => vector(rgb, 0, 1),
     move: () => vector(translation, -Infinity, Infinity), duplicate: () => vector(translation, -Infinity, Infinity),
   };
   return within(rows, 0, count - 1) && (values[op]?.() ?? false);

@@ -123,7 +123,7 @@ export class Tools {
   }
 
   wheel(event) {
-    if (event.target.closest(".card")) return;
+    if (event.target.closest(".card") || (window !== parent && !document.hasFocus())) return; // in a frame: after a click
     event.preventDefault();
     const lines = event.deltaMode ? 30 : 1;
     this.eye.zoom(Math.exp(Math.min(Math.max(event.deltaY * lines, -200), 200) / 600));

@@ -142,8 +142,7 @@ def test_one_person_everywhere(browser, tmp_path, home):
         page.mouse.up()
         selected = mask(page, "color")
         assert 0 < selected.sum() < len(selected)
-        page.locator(".stage").focus()
-        page.keyboard.press("Delete")  # remove
+        page.press(".stage", "Delete")  # remove
         assert page.evaluate("viewer.model.counts('color').total") == int((~selected).sum())
         page.keyboard.press("Control+z")  # undo
         np.testing.assert_array_equal(mask(page, "color"), selected)
@@ -158,14 +157,12 @@ def test_one_person_everywhere(browser, tmp_path, home):
             part = mask(page, "color")
             assert 0 < part.sum() <= selected.sum()
             assert not (part & ~selected).any()
-            page.locator(".stage").focus()
-            page.keyboard.press("Control+z")
+            page.press(".stage", "Control+z")
             page.click("text=Save Gaussians")
             page.wait_for_selector("[role=alert]:has-text('Saved:')")
             written = read_splats(out / "selection_001" / "selection_color.ply")
             np.testing.assert_allclose(written.means, state.cloud("color").means[selected], rtol=1e-6)
-            page.locator(".stage").focus()
-            page.keyboard.press("Delete")
+            page.press(".stage", "Delete")
             page.click("text=Save edited scene")
             page.wait_for_selector("[role=alert]:has-text('edited_001')")
             assert len(read_splats(out / "edited_001" / "color.ply")) == int((~selected).sum())

@@ -146,8 +146,7 @@ def test_the_widget_talks_back(browser, tmp_path):
         page.keyboard.press("Enter")
         lab.until(lambda: lab.python("[viewer.question, viewer.state.asked.words]"), ["table", "table"])
         # a lasso is a selection in the next cell
-        page.locator(".kfgs .stage").focus()
-        page.keyboard.press("3")
+        page.press(".kfgs .stage", "3")
         x, y, width, height = page.locator(".kfgs .stage").bounding_box().values()
         page.mouse.move(x + 0.15 * width, y + 0.2 * height)
         page.mouse.down()
@@ -159,11 +158,9 @@ def test_the_widget_talks_back(browser, tmp_path):
         lab.until(lambda: lab.python("viewer.selection.indices.tolist()"), lasso)
         assert lab.python("len(splat[viewer.selection])") == len(lasso)
         # an edit of the widget is an edit in Python; undo takes it back
-        page.locator(".kfgs .stage").focus()
-        page.keyboard.press("Delete")
+        page.press(".kfgs .stage", "Delete")
         lab.until(lambda: lab.python("len(viewer.edits.apply(splat))"), 450 - len(lasso))
-        page.locator(".kfgs .stage").focus()
-        page.keyboard.press("Control+z")
+        page.press(".kfgs .stage", "Control+z")
         lab.until(lambda: lab.python("[len(viewer.edits), viewer.selection.indices.tolist()]"), [0, lasso])
         # Python sets a selection and an edit; a person undoes the edit
         lab.python("setattr(viewer, 'selection', splat.means[:, 0] > 0)")
@@ -171,8 +168,7 @@ def test_the_widget_talks_back(browser, tmp_path):
         lab.until(lambda: lab.browser("model.counts('color').selected"), right)
         lab.python("setattr(viewer, 'edits', [__import__('kfgs').Remove(viewer.selection)])")
         lab.until(lambda: lab.browser("model.counts('color').total"), 450 - right)
-        page.locator(".kfgs .stage").focus()
-        page.keyboard.press("Control+z")
+        page.press(".kfgs .stage", "Control+z")
         lab.until(lambda: lab.browser("model.counts('color').total"), 450)
         lab.until(lambda: lab.python("len(viewer.edits)"), 0)
         # a thing that Python adds, and the tape
@@ -182,7 +178,6 @@ def test_the_widget_talks_back(browser, tmp_path):
         lab.until(lambda: lab.browser("model.length"), 5)
         # the camera
         before = lab.python("viewer.camera.viewmat.tolist()")
-        page.locator(".kfgs .stage").focus()
-        page.keyboard.press("ArrowLeft")
+        page.press(".kfgs .stage", "ArrowLeft")
         lab.until(lambda: lab.python("viewer.camera.viewmat.tolist()") == before, False)
     page.close()
