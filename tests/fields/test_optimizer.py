@@ -235,9 +235,8 @@ def test_children_are_drawn_from_their_parent():
     R = torch.tensor([[math.cos(turn), -math.sin(turn), 0], [math.sin(turn), math.cos(turn), 0], [0, 0, 1]])
     expected = R @ torch.diag(torch.tensor([0.81, 0.09, 0.01])) @ R.T
     assert len(grown.parent) == 2 * n
-    torch.testing.assert_close(
-        grown.raw["means"].mean(dim=0), start["means"][0], atol=0.02, rtol=0
-    )  # 4 standard errors
+    mean = grown.raw["means"].mean(dim=0)
+    torch.testing.assert_close(mean, start["means"][0], atol=0.02, rtol=0)  # 4 standard errors
     torch.testing.assert_close(grown.raw["means"].T.cov(), expected, atol=0.025, rtol=0)
 
 

@@ -173,9 +173,8 @@ def test_edits_are_those_of_python(page, state, tmp_path):
     assert copies == list(range(450, 450 + len(chosen)))
     page.evaluate("viewer.model.move([0, 0, 1])")
     page.evaluate("viewer.model.move([0, 0.5, 1], true)")  # of one drag
-    page.evaluate(
-        "viewer.model.select('color', Uint8Array.from({length: viewer.model.total('color')}, (_, i) => i < 5))"
-    )
+    script = "viewer.model.select('color', Uint8Array.from({length: viewer.model.total('color')}, (_, i) => i < 5))"
+    page.evaluate(script)
     page.press(".stage", "Delete")
     saved = json.loads(page.evaluate("JSON.stringify(viewer.model)"))["sides"]["color"]
     assert [edit["op"] for edit in saved["edits"]] == ["recolor", "opacity", "duplicate", "move", "remove"]
