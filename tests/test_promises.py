@@ -13,11 +13,8 @@ if not PROMISES.is_file():
 
 
 def test_every_promise_names_a_test_that_exists():
-    rows = [
-        line
-        for line in PROMISES.read_text(encoding="utf-8").splitlines()
-        if line.startswith("| ") and "| test |" not in line
-    ]
+    lines = PROMISES.read_text(encoding="utf-8").splitlines()
+    rows = [line for line in lines if line.startswith("| ") and "| test |" not in line]
     assert 10 < len(rows) < 25
     for row in rows:
         named = re.findall(r"`(tests/[\w/]+\.py)::(\w+)`", row)

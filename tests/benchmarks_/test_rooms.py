@@ -64,21 +64,6 @@ def test_cameras_stand_free_in_the_room_and_see():
     assert apart.min() > rooms_path.APART
 
 
-def test_test_views_show_what_training_views_saw():
-    poses = list(plan().values())
-    for pose in poses[10:]:
-        origins, directions, _ = LENS.rays(pose, 4)
-        points = origins + directions * distances(origins, directions)[:, None]
-        count = rooms_path.views_of(distances, LENS, poses[:10], points)
-        assert (count >= 2).mean() >= rooms_path.KNOWN - 0.05  # judged on other pixels
-
-
-def test_a_place_in_the_table_or_outside_is_refused():
-    for place in ([2.2, 2.0, 1.0], [9.0, 9.0, 1.0]):
-        with pytest.raises(ValueError, match="inside: expected a place"):
-            rooms_path.free_places(lambda o, d: np.where(o[:, 0] > 5, np.inf, distances(o, d)), np.array(place))
-
-
 def test_pixels_undo_rays():
     pose = rooms_path.look(CENTRE, np.array([1.0, 0.5, -0.2]))
     origins, directions, lengths = LENS.rays(pose)

@@ -9,6 +9,7 @@ from kfgs import Camera, read_splats, write_splats
 from kfgs.labels import Duplicate, OfClass, Remove, connected_parts, number_instances, transfer_labels
 from kfgs.labels.components import number_parts
 from kfgs.labels.edit_list import join
+from kfgs.labels.instances import _join, _pieces
 
 NAMES = ("floor", "chair")
 
@@ -56,6 +57,25 @@ def test_views_part_what_distance_joins_and_a_leg_belongs_to_what_it_touches(tmp
     carried = transfer_labels(told, balls(cloud.means + 0.01), 0.05)
     np.testing.assert_array_equal(carried.extra["instance"], told.extra["instance"], strict=True)  # type too
     assert not transfer_labels(cloud, carried).extra  # old numbers go with the old labels
+
+
+def test_parts_join_while_most_views_say_so_then_small_ones_by_touch_and_the_unseen_by_distance():
+    """Cells 1 apart, and one far away. The first two are together in 6 of 10 views, 3 and 4 are unseen, 2 is small."""
+    centres = torch.tensor([0.0, 1, 2, 3, 4, 5, 20])[:, None] * torch.tensor([1.0, 0, 0])
+    seen = np.diag([1.0, 1, 1, 0, 0, 1, 1])
+    seen = 10 * seen.diagonal()[:, None] * seen.diagonal()
+    together = np.diag(seen.diagonal())
+    together[0, 1] = together[1, 0] = 6
+    number = _join(together, seen, centres.numpy(), np.array([10, 10, 1, 1, 1, 9, 1]))
+    assert [number.tolist().index(part) for part in number] == [0, 0, 0, 0, 4, 4, 6]
+
+
+def test_a_jump_in_depth_cuts_a_class_and_specks_are_no_pieces():
+    near, far = box((-0.5, -0.5, 1.0), (0.5, 0.5, 1.0), 0.05), box((-1.5, -1.5, 0.0), (1.5, 1.5, 0.0), 0.05)
+    cloud = balls(torch.cat([near, far]), [1] * (len(near) + len(far)), scale=0.03, opacity=0.99)
+    piece = _pieces(cloud, Camera.look_at((0, 0, 4), (0, 0, 0), up=(0, 1, 0), width=100, height=100))[1]
+    sizes = np.bincount(piece.ravel())[1:]
+    assert sorted(sizes[sizes > 0] > 200) == [True, True]
 
 
 def test_things_of_several_classes_keep_apart():
