@@ -225,6 +225,8 @@ def _pack(source: Path, target: Path, precision: Any) -> None:
 
 def _convert_by_class(source: Path, folder: Path) -> None:
     """One plain PLY for each class of a splat. The class is in the name of its file, and in none next to it."""
+    from ..labels.transfer import without_instances
+
     check_output("target", folder, "a folder")
     splats = open_splats("source", source, labelled=True)
     if len(splats) == 0:
@@ -232,8 +234,7 @@ def _convert_by_class(source: Path, folder: Path) -> None:
     parts = {}
     for label, part in splats.by_class().items():  # numbers keep names apart that a file's name cannot hold
         word = re.sub(r"[^\w-]+", "_", splats.names[label] if 0 <= label < len(splats.names) else "").strip("_")[:80]
-        kept = {name: column for name, column in part.extra.items() if name != "instance"}
-        plain = part.replace(labels=None, scores=None, extra=kept)
+        plain = without_instances(part).replace(labels=None, scores=None)
         parts[f"{label:02d}{word and '_'}{word}.ply" if label >= 0 else "unlabelled.ply"] = plain
     if any((folder / name).is_file() and (folder / name).samefile(source) for name in parts):
         raise ValueError(f"target: expected another folder than that of {source}, which is read; give another name")

@@ -19,14 +19,12 @@ SPACINGS = 1.5  # the default distance in spacings of the selection: on room_0 2
 MOST_SPACINGS = 4.0  # ... and its bound in spacings of the cloud: a few specks across a room have a spacing of metres
 
 
-def part_distance(means: Tensor, mask: Tensor, whole: float = 0.0) -> float:  # [N, 3], [N] bool
-    """The default distance of `number_parts`, in world units: 1.5 spacings of the masked Gaussians, at most 4 of all.
+def part_distance(points: Array, whole: float) -> float:  # [n, 3] of a selection
+    """The default distance of `number_parts`, in world units: 1.5 spacings of the points, at most 4 of the whole cloud.
 
     It keeps a thing in one piece, and things apart. No constant does: on room_0 0.08 m joins two chairs and breaks a sofa.
     """
-    points = positions("means", means)
-    own, whole = spacing(points[mask.cpu().numpy()]), whole or spacing(points)
-    return min(SPACINGS * own, MOST_SPACINGS * whole) or 1.0  # all at one position: any distance joins them
+    return min(SPACINGS * spacing(points), MOST_SPACINGS * whole) or 1.0  # all at one position: any distance joins them
 
 
 def number_parts(gaussians: Gaussians, mask: Tensor, distance: float | None = None) -> Tensor:  # [N] int64
@@ -42,11 +40,10 @@ def number_parts(gaussians: Gaussians, mask: Tensor, distance: float | None = No
         thing = torch.from_numpy(column.astype(np.int64)).to(mask.device)
         numbers = thing - 1 + (labels - labels[mask].min()) * (thing.max() + 1)
         return numbers.masked_fill(~mask | (thing < 1), -1)
-    points = positions("gaussians.means", gaussians.means)[mask.cpu().numpy()]
-    parts = radius_components(points, distance or part_distance(gaussians.means, mask))
-    numbers = torch.full(mask.shape, -1, device=mask.device)
-    numbers[mask] = torch.from_numpy(parts).to(mask.device)
-    return numbers
+    means = positions("gaussians.means", gaussians.means)
+    points = means[mask.cpu().numpy()]
+    parts = radius_components(points, distance or part_distance(points, spacing(means)))
+    return torch.full(mask.shape, -1, device=mask.device).masked_scatter(mask, torch.from_numpy(parts).to(mask.device))
 
 
 def radius_components(

@@ -48,25 +48,25 @@ def number_instances(gaussians: Any, cameras: Sequence[Camera]) -> Gaussians:
     labels, means = cloud.labels.cpu().numpy(), positions("gaussians.means", cloud.means)
     cell, grids, whole = np.zeros(len(labels), np.int64), {}, spacing(means)
     for label in np.unique(labels[labels >= 0]).tolist():
-        size, own = part_distance(cloud.means, cloud.labels == label, whole), labels == label
+        own = labels == label
+        size = part_distance(means[own], whole)
         while len((grid := cells(means[own], size))[1]) > CELLS:
             size *= 1.25
         cell[own], centres = grid
-        grids[label] = centres / size, np.zeros((2, len(centres), len(centres)))
+        grids[label] = own, centres / size, np.zeros((2, len(centres), len(centres)))
     for camera in (camera.fitted(SIDE) for camera in cameras[:: -(-len(cameras) // VIEWS)] if grids):
         kind, piece = _pieces(cloud, camera)
         names, first, piece = np.unique(piece, return_index=True, return_inverse=True)
         signal = torch.eye(len(names)).to(cloud.means)[torch.from_numpy(piece).reshape(camera.size)][..., names > 0]
         index, shares, _ = (part.cpu().numpy() for part in sum_pixels(cloud, camera, signal))
-        for label, (_, table) in grids.items():
+        for label, (_, _, table) in grids.items():
             own, its = labels[index] == label, kind.ravel()[first[names > 0]] == label
             shown = np.zeros((table.shape[1], its.sum()))
             np.add.at(shown, cell[index[own]], shares[own][:, its])
             shown /= np.maximum(shown.sum(1), 1)[:, None]  # a view counts once, or less if it shows less than a pixel
             table += shown @ shown.T, np.outer(shown.sum(1), shown.sum(1))
     numbers = np.zeros(len(labels), np.float32)  # as `class_id` in files: some importers skip no other columns
-    for label, (centres, (together, seen)) in grids.items():
-        own = labels == label
+    for own, centres, (together, seen) in grids.values():
         part = largest_first(_join(together, seen, centres, np.bincount(cell[own]))[cell[own]])
         large = np.bincount(part) >= SPECK * (part == 0).sum()
         numbers[own] = np.where(large[part], part + 1, 0)

@@ -70,13 +70,12 @@ def transfer_labels(source: Any, target: Gaussians, distance: float | None = Non
         >>> transfer_labels(cloud, cloud.replace(means=b, labels=None), 0.4).labels.tolist()
         [0, -1]
     """
-    source, target = as_cloud(source, "source", labelled=True), as_cloud(target, "target")
+    source, target = as_cloud(source, "source", labelled=True), without_instances(as_cloud(target, "target"))
     places = recounted(target.means, target.origin, source.origin)
     carried = nearest_labels(source.means, source.labels, places, distance)
-    extra = {name: column for name, column in target.extra.items() if name != INSTANCE}  # it numbers the old labels
+    extra, scores = {**target.extra}, carried.scores.to(target.means.dtype)
     if INSTANCE in source.extra:
         extra[INSTANCE] = np.pad(source.extra[INSTANCE], (0, 1))[carried.sources.cpu()]
-    scores = carried.scores.to(target.means.dtype)
     return target.replace(labels=carried.labels, scores=scores, names=source.names, extra=extra)
 
 
@@ -179,6 +178,11 @@ def as_cloud(value: Any, name: str = "gaussians", *, labelled: bool = False) -> 
     if labelled and value.labels is None:
         raise ValueError(f"{name}: expected labels, got {value!r}; SemanticField.label or transfer_labels gives some")
     return value
+
+
+def without_instances(gaussians: Gaussians) -> Gaussians:
+    """Without the column `instance`: it numbers things of labels that go."""
+    return gaussians.replace(extra={name: column for name, column in gaussians.extra.items() if name != INSTANCE})
 
 
 def sampled(points: Array) -> Array:

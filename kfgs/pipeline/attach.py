@@ -23,7 +23,7 @@ from ..formats.ply_3dgs import label_column
 from ..formats.sidecar import write_names
 from ..gaussians import Gaussians
 from ..labels import LabelSet, Transfer, nearest_labels, number_instances
-from ..labels.transfer import INSTANCE
+from ..labels.transfer import without_instances
 from ..scenes import SceneError, align_by_cameras, frames_agree
 from ..scenes.frames import Alignment
 from ..splat import transform_gaussians, vote_labels
@@ -152,8 +152,7 @@ def attach(
         who = "that no view shows" if ways else "got a class"
         ways.append(f"{transfer.labelled:,} {who} by distance (lambda {transfer.distance:.3g})")
     note = f"{how['labelled by']}: of {len(splats):,} Gaussians {', '.join(ways)}, {transfer.orphaned:,} got none"
-    extra = {name: column for name, column in splats.extra.items() if name != INSTANCE}  # it numbers the old labels
-    labelled = splats.replace(labels=labels, scores=scores.float(), names=semantic.names, extra=extra)
+    labelled = without_instances(splats).replace(labels=labels, scores=scores.float(), names=semantic.names)
     if cameras:
         labelled = number_instances(labelled, [similarity.apply_to_camera(camera) for camera in cameras])
     return Attached(labelled, transfer, similarity, alignment, (frame_note, note), facts)

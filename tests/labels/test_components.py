@@ -7,7 +7,7 @@ import torch
 from cases_clouds import balls
 from oracles_selection import components as oracle
 
-from kfgs.labels.components import number_parts, part_distance, radius_components
+from kfgs.labels.components import number_parts, part_distance, radius_components, spacing
 
 
 def clumps(n, heaps, spread, seed):
@@ -49,15 +49,14 @@ def grid(origin, n=5, step=0.1):
 def test_default_distance_follows_the_selection():
     """On a grid, 90 % have their fourth neighbour within sqrt(2) steps: a corner's is (1, 1), an edge's (1, 1) too."""
     dense, sparse = grid([0.0, 0, 0], n=20, step=0.1), grid([100.0, 0, 0], n=20, step=0.3)
-    means = torch.cat([dense, sparse])
-    first = torch.arange(800) < 400
-    step = part_distance(means, first)
+    means = torch.cat([dense, sparse]).double().numpy()
+    first, whole = np.arange(800) < 400, spacing(means)
+    step = part_distance(means[first], whole)
     assert step == pytest.approx(1.5 * 0.1 * math.sqrt(2), rel=1e-4)
-    assert part_distance(means, ~first) == pytest.approx(3 * step, rel=1e-4)
-    assert part_distance(means * 7, first) == pytest.approx(7 * step, rel=1e-4)
-    specks = torch.zeros(800, dtype=torch.bool)
-    specks[[0, 399, 799]] = True
-    assert part_distance(means, specks) <= 4 * 0.3 * math.sqrt(2) + 1e-6  # not the hundred between the sheets
+    assert part_distance(means[~first], whole) == pytest.approx(3 * step, rel=1e-4)
+    assert part_distance(7 * means[first], spacing(7 * means)) == pytest.approx(7 * step, rel=1e-4)
+    specks = means[[0, 399, 799]]
+    assert part_distance(specks, whole) <= 4 * 0.3 * math.sqrt(2) + 1e-6  # not the hundred between the sheets
     assert number_parts(balls(torch.ones(3, 3)), torch.ones(3, dtype=torch.bool)).tolist() == [0, 0, 0]
 
 
