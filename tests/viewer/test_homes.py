@@ -95,7 +95,7 @@ def test_a_file_that_is_dropped_opens_in_a_page_alone(browser, tmp_path, home, m
             page.wait_for_selector(".kfgs:not([aria-busy]) .said:has-text('77 Gaussians')")
             assert (page.locator("h1").inner_text(), page.evaluate("viewer.model.total('semantic')")) == ("small", 77)
             page.evaluate(DROP, ["..\\wrong.ply", base64.b64encode(b"no splat").decode()])
-            page.wait_for_selector("[role=alert]:has-text('wrong.ply')")
+            page.wait_for_selector("[role=alert]:has-text('wrong.ply: expected')")
             assert str(tmp_path) not in page.locator(".toast").inner_text()
         else:
             page.wait_for_selector("[role=alert]:has-text('run “kfgs view small.ply”')")
