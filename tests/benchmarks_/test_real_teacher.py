@@ -60,14 +60,17 @@ def test_void_is_not_learnt(backbone, room, tmp_path):
         labels = np.array(Image.open(room / "labels" / f"{stem}.png"))
         labels[:, :40] = 255
         Image.fromarray(labels).save(tmp_path / f"{stem}.png")
-    tokens, found = real_teacher.labelled_tokens(teacher, scene, tmp_path)
+
+    def encode(i):
+        return teacher.encode_image(scene.image(i).permute(2, 0, 1)).permute(1, 2, 0)
+
+    tokens, found = real_teacher.labelled_tokens(encode, scene, tmp_path)
     assert tokens.shape == (2 * 8 * 5, 32)  # the right half of 8 x 10 patches of 8 x 8 in each of the two
     truth = load_label_map(room / "labels" / f"{train[0]}.png")
     rows = [int((i + 0.5) * 60 / 8) for i in range(8)]
     assert found[:40].tolist() == [int(truth[row, 8 * j + 4]) for row in rows for j in range(5, 10)]
-    picture = teacher.encode_image(scene.image(scene.views("train")[0]).permute(2, 0, 1))
-    assert torch.equal(tokens[:40], picture[:, :, 5:].flatten(1).T)
-    refused(lambda: real_teacher.labelled_tokens(teacher, scene, tmp_path / "none"), "label", "training", "got none")
+    assert torch.equal(tokens[:40], encode(scene.views("train")[0])[:, 5:].flatten(0, 1))
+    refused(lambda: real_teacher.labelled_tokens(encode, scene, tmp_path / "none"), "label", "training", "got none")
 
 
 def test_commands_make_the_maps_that_the_teacher_makes(backbone, room, tmp_path, monkeypatch, capsys):
