@@ -26,16 +26,8 @@ def means_by_weight(weights, signals):
 
 def unit_maps(maps):
     """Features of length 1, and NaN for all-zero ones."""
-    result = []
-    for features in maps:
-        unit = np.full(features.shape, np.nan)
-        for y in range(features.shape[0]):
-            for x in range(features.shape[1]):
-                length = np.sqrt((features[y, x] ** 2).sum())
-                if length > 1e-8:
-                    unit[y, x] = features[y, x] / length
-        result.append(unit)
-    return result
+    lengths = [np.sqrt((features**2).sum(-1, keepdims=True)) for features in maps]
+    return [f / np.where(length > 1e-8, length, np.nan) for f, length in zip(maps, lengths, strict=True)]
 
 
 def lacking(weights, signals, features):
@@ -63,16 +55,24 @@ def reliable_share(one, other, places, neighbours):
     return np.array(result)
 
 
+def trust(height, width):
+    """How much each pixel counts: four times its distance from the nearest border, in picture sizes; 0.05 to 1."""
+    y, x = np.mgrid[:height, :width] + 0.5
+    edges = [x / width, 1 - x / width, y / height, 1 - y / height]
+    return np.clip(4 * np.min(edges, axis=0), 0.05, 1)[..., None]
+
+
 def uplift(weights, maps, places, corrections, neighbours):
     """The fused feature of each Gaussian: even and odd views apart, some passes of SIRT, and the mean of both by weight."""
     signals = unit_maps(maps)
     halves = [range(0, len(maps), 2), range(1, len(maps), 2)]
     views = [[weights[i] for i in half] for half in halves]
+    counted = [[view * trust(*view.shape[:2]) for view in half] for half in views]
     shown = [[signals[i] for i in half] for half in halves]
-    (even, even_weight), (odd, odd_weight) = (means_by_weight(views[h], shown[h]) for h in (0, 1))
+    (even, even_weight), (odd, odd_weight) = (means_by_weight(counted[h], shown[h]) for h in (0, 1))
     for _ in range(corrections):
-        of_even = means_by_weight(views[0], lacking(views[0], shown[0], even))[0]
-        of_odd = means_by_weight(views[1], lacking(views[1], shown[1], odd))[0]
+        of_even = means_by_weight(counted[0], lacking(views[0], shown[0], even))[0]
+        of_odd = means_by_weight(counted[1], lacking(views[1], shown[1], odd))[0]
         share = reliable_share(of_even, of_odd, places, neighbours)
         even, odd = even + share[:, None] * of_even, odd + share[:, None] * of_odd
     total = even_weight + odd_weight

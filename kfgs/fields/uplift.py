@@ -43,6 +43,10 @@ SPARSE = 0.3  # share of the views' pixels: a splat of the scene fills nearly al
 NEIGHBOURS = 17  # a Gaussian and its 16 nearest, whose corrections are judged together
 KEEP, MOST = 0.999, 64  # share of the codewords' variation to keep, with at most this many latents
 PIXELS = 80_000  # most pixels of a view that are rendered
+BORDER, LEAST = (
+    0.25,
+    0.05,
+)  # in so wide a margin pixels count less, down to the least: networks err where things are cut off
 
 
 @dataclass(frozen=True)
@@ -130,11 +134,9 @@ def uplift_maps(
         directions = (sample_latents(maps) if latents is None else latents).basis.to(cloud.means)
         views = WorkingMaps(cameras, maps, directions, config.pixels, scratch or Path(temporary))
         sums, shown = sum_views(cloud, views, bar)
-        if not bool((shown > 0).any()):
-            raise ValueError(
-                "cameras: expected views that show the Gaussians, got none that does; do both share one frame?"
-            )
         filled = float(shown.sum()) / sum(camera.width * camera.height for camera in cameras)
+        if filled == 0:
+            raise ValueError("cameras: expected views that show the Gaussians, got none; do both share one frame?")
         if latents is None:
             rows, weights = unit_rows(per_weight(sums.sum(0))), cap(shown, shown[shown > 0])
             fitted = fit_linear_latents(rows, weights, keep=config.keep, maximum=config.max_latents).basis
@@ -161,9 +163,9 @@ def sum_views(cloud: Gaussians, views: WorkingMaps, bar: Any) -> tuple[Tensor, T
     sums = cloud.means.new_zeros(2, len(cloud), channels + 1)
     for i in range(len(views)):
         view, half = views[i], sums[i % 2]
-        index, total, _ = sum_pixels(cloud, view.camera, _known(view.map, view.camera.size))
+        index, total, filled = sum_pixels(cloud, view.camera, _known(view.map, view.camera.size))
         half.index_add_(0, index, total)
-        shown.index_add_(0, index, view.scale * total[:, -1])
+        shown.index_add_(0, index, view.scale * filled)
         bar.update()
     return sums, shown
 
@@ -212,9 +214,11 @@ def per_weight(sums: Tensor) -> Tensor:  # [..., d + 1] -> [..., d]
 
 
 def _known(signal: Tensor, size: tuple[int, int]) -> Tensor:  # [h, w, c] -> [H, W, c + 1]
-    """A map in a camera's size, 0 where it is unknown, and which pixels are known as its last channel."""
+    """A map in a camera's size times how much each pixel counts, and this as the last channel: 0 if unknown, see `BORDER`."""
     known = ~signal[..., :1].isnan()
-    return resize_map(torch.cat([torch.where(known, signal, 0), known.to(signal)], dim=-1), size).contiguous()
+    down, across = (torch.minimum(at, 1 - at) for at in ((torch.arange(n) + 0.5) / n for n in size))
+    trust = (torch.minimum(down[:, None], across) / BORDER).clamp(LEAST, 1)[..., None].to(signal)
+    return (resize_map(torch.cat([torch.where(known, signal, 0), known.to(signal)], dim=-1), size) * trust).contiguous()
 
 
 def fuse_views(field: SemanticField, cameras: Sequence[Camera]) -> SemanticField:
@@ -229,20 +233,17 @@ def fuse_views(field: SemanticField, cameras: Sequence[Camera]) -> SemanticField
     if isinstance(decoder, Linear):
         return replace(field, cameras=tuple(cameras))
     with torch.no_grad():
-        if isinstance(decoder, Codewords | Autoencoded):
-            rows, weights = decoder.codebook.unit, None
-        else:
-            rows, weights = unit_rows(field.latents), gaussians.opacities
+        book = decoder.codebook if isinstance(decoder, Codewords | Autoencoded) else None
+        rows, weights = (unit_rows(field.latents), gaussians.opacities) if book is None else (book.unit, None)
         latents = fit_linear_latents(rows, weights, keep=KEEP, maximum=MOST)
         table = torch.nn.functional.pad(latents.encode(rows), (0, 0, 0, 1)).to(gaussians.means)  # nothing known: zeros
 
         def show(camera: Camera) -> tuple[Camera, Tensor]:  # [H, W, e]
             factor = min(1.0, (PIXELS / (camera.width * camera.height)) ** 0.5)
             small = camera.resized(max(1, round(camera.height * factor)), max(1, round(camera.width * factor)))
-            rendering = rasterize(gaussians, small)
-            pixels = rendering.map
+            pixels, alpha, _ = rasterize(gaussians, small)
             if isinstance(decoder, Codewords | Autoencoded):
-                return small, table[decoder.codewords(pixels, rendering.alpha > 0)]
+                return small, table[decoder.codewords(pixels, alpha > 0)]
             return small, latents.encode(unit_rows(pixels)) * (row_norms(pixels) > EPS)[..., None]
 
         means = average_views(gaussians, map(show, cameras)).values

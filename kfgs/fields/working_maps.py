@@ -105,10 +105,8 @@ class WorkingMaps:
 
     def _shrinkage(self, height: int, width: int) -> int:
         """By which whole number a map is shrunk to have at most so many pixels."""
-        shrink = 1
-        while (height // shrink) * (width // shrink) > self._pixels and shrink < min(height, width):
-            shrink += 1
-        return shrink
+        least = min(height, width)
+        return next((n for n in range(1, least) if (height // n) * (width // n) <= self._pixels), least)
 
 
 def sample_latents(maps: FeatureMaps, count: int = WORKING, most: int = LOOKED_AT[0]) -> LinearLatents:
