@@ -5,8 +5,9 @@
     python benchmarks/unseen.py table OUT ROOM... --colors COLORS        # COLORS/<name>/color.ply, by `kfgs color`
 
 ROOM is a scene with classes.json and labels/ (of benchmarks/rooms.py; or labels_scored/, which is scored if it is there); its
-folder's name is the room's. `maps` writes OUT/TEACHER/<name>/<stem>.npy of all views, the rows of its classes to
-OUT/text/TEACHER/<name>.npy and the teacher's own score on the test views to OUT/scores/. The teachers:
+folder's name is the room's. `maps` writes OUT/TEACHER/<name>/<stem>.npy of all views, the teacher's own score on the test
+views to OUT/scores/, and OUT/scenes/TEACHER/<name>: links to ROOM, and text.npy with this teacher's rows of the classes, for
+other programs (`python benchmarks/table1.py OUT/scenes/ade/<name> OUT/ade/<name> TABLE`). The teachers:
 
 ade     A network for ADE20K's 150 classes. LOGITS/<name>/<stem>.npy has its logits [h, w, 150], of which 0 is the background and
         1 the wall; any network will do. A class of the room is the largest of some logits (`ADE_WORDS`), and so the map is [h, w,
@@ -52,6 +53,7 @@ from kfgs.scenes import extract_features, save_feature_map
 from kfgs.teachers import load_teacher
 
 ADE20K = Path(__file__).parents[1] / "kfgs/evaluation/data/ade20k.json"
+KEYS = ("miou", "known", "accuracy")
 TEACHERS = {"ade": "ADE20K network", "loo": "DINOv2, head of the other rooms", "own": "DINOv2, the room's own head"}
 
 # ADE20K's words for a class, the closest first. A word that several classes of a room name is the one's that names it earliest.
@@ -104,7 +106,8 @@ class Room:
     """A labelled scene."""
 
     def __init__(self, folder: Path) -> None:
-        self.name, self.scene = folder.resolve().name, load_scene(folder).undistorted()
+        self.folder, self.scene = folder.resolve(), load_scene(folder).undistorted()
+        self.name = self.folder.name
         self.labels = folder / "labels"
         self.names: list[str] = json.loads((folder / "classes.json").read_text(encoding="utf-8"))
         scored = folder / "labels_scored"
@@ -185,7 +188,7 @@ def known_classes(teacher: str, room: Room, rooms: Sequence[Room]) -> list[str]:
 
 def make_maps(teacher: str, room: Room, rooms: Sequence[Room], args: argparse.Namespace) -> None:
     """Write a teacher's maps of a room, the rows of the classes, and the teacher's score."""
-    out, text = args.out / teacher / room.name, args.out / "text" / teacher / f"{room.name}.npy"
+    out, linked = args.out / teacher / room.name, args.out / "scenes" / teacher / room.name
     if teacher == "ade":
         logits, channels = FeatureFolder(args.logits / room.name).of(room.scene, "all"), ade_channels(room.names)
         rows, encode = torch.eye(len(room.names)), lambda i: group_scores(logits[i], channels)
@@ -196,8 +199,11 @@ def make_maps(teacher: str, room: Room, rooms: Sequence[Room], args: argparse.Na
         rows, encode = text_rows(room.names, words), lambda i: linear(tokens[i], weight, bias)
     for i in room.scene.views("all"):
         save_feature_map(out, room.scene.stem(i), encode(i))
-    text.parent.mkdir(parents=True, exist_ok=True)
-    np.save(text, rows.numpy())
+    linked.mkdir(parents=True, exist_ok=True)
+    for entry in room.folder.iterdir():
+        if entry.name != "text.npy" and not (linked / entry.name).exists():
+            (linked / entry.name).symlink_to(entry)
+    np.save(linked / "text.npy", rows.numpy())
     test = room.scene.views("test")
     maps = maps_of_views(room.scene, test, FeatureFolder(out).of(room.scene, "test"))
     smooth = TeacherMethod({room.scene.stem(i): maps[k] for k, i in enumerate(test)})
@@ -224,7 +230,8 @@ def fuse_maps(teacher: str, room: Room, args: argparse.Namespace) -> None:
     """Add the score of the default field on a teacher's maps."""
     file = score_file(args.out, teacher, room)
     score = json.loads(file.read_text(encoding="utf-8"))
-    classes = LabelSet(room.names, torch.from_numpy(np.load(args.out / "text" / teacher / f"{room.name}.npy")))
+    linked = args.out / "scenes" / teacher / room.name
+    classes = load_label_set(linked / "classes.json", linked / "text.npy")
     maps = FeatureFolder(args.out / teacher / room.name).of(room.scene, "train")
     splat = args.colors / room.name / "color.ply"
     field = fit(room.scene, maps, Uplift(splat), folder=args.out / "fields" / f"{teacher}-{room.name}", seed=0)
@@ -233,29 +240,23 @@ def fuse_maps(teacher: str, room: Room, args: argparse.Namespace) -> None:
 
 
 def table(scores: Sequence[dict[str, Any]]) -> str:
-    """Markdown: a row for each teacher and room, and one for the mean and the spread of the differences over rooms."""
-    head = "| teacher | room | alone: mIoU, known classes, accuracy | default field | difference |"
-    lines = [head, "|---|---|---|---|---|"]
-    keys = ("miou", "known", "accuracy")
+    """Markdown: a row for each teacher and room, and one for the mean over rooms with the range of the differences.
+
+    A cell is the score of the teacher alone, that of the field, and the difference.
+    """
+    lines = ["| teacher | room | mIoU | mIoU, known classes | accuracy |", "|---|---|---|---|---|"]
     for teacher, title in TEACHERS.items():
         rows = [score for score in scores if score["teacher"] == teacher]
-        values = [[[score[what][key] for key in keys] for what in ("alone", "field")] for score in rows]
-        for score, (alone, field) in zip(rows, values, strict=True):
-            gain = ", ".join(f"{after - before:+.1f}" for before, after in zip(alone, field, strict=True))
-            lines.append(f"| {title} | {score['room']} | {_numbers(alone)} | {_numbers(field)} | {gain} |")
+        pairs = np.array([[[row[what][key] for key in KEYS] for what in ("alone", "field")] for row in rows])
+        for row, pair in zip(rows, pairs, strict=True):
+            cells = [f"{alone:.1f} to {field:.1f}, {field - alone:+.1f}" for alone, field in pair.T]
+            lines.append(f"| {title} | {row['room']} | {' | '.join(cells)} |")
         if len(rows) > 1:
-            mean = np.array(values).mean(0)  # [2, 3]
-            gains = np.array([np.subtract(field, alone) for alone, field in values])
-            spread = [
-                f"{m:+.1f} ({low:+.1f} to {high:+.1f})"
-                for m, low, high in zip(gains.mean(0), gains.min(0), gains.max(0), strict=True)
-            ]
-            lines.append(f"| {title} | **mean** | {_numbers(mean[0])} | {_numbers(mean[1])} | {', '.join(spread)} |")
+            gains = pairs[:, 1] - pairs[:, 0]
+            means = zip(*pairs.mean(0), *(f(gains, 0) for f in (np.mean, np.min, np.max)), strict=True)
+            cells = [f"{a:.1f} to {b:.1f}, **{m:+.1f}** ({low:+.1f} to {high:+.1f})" for a, b, m, low, high in means]
+            lines.append(f"| {title} | **mean** | {' | '.join(cells)} |")
     return "\n".join(lines)
-
-
-def _numbers(values: Sequence[float]) -> str:
-    return ", ".join(f"{value:.1f}" for value in values)
 
 
 def main() -> None:
