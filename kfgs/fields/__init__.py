@@ -6,7 +6,6 @@
 from .decoders import Autoencoded, Codewords, Identity, Linear
 from .examples import Box, Clicks, Mask, label_set_from_examples
 from .loss import ColorLoss
-from .merge import merge_gaussians
 from .options import Densify, Rates, Training
 from .semantic_field import SemanticField
 from .start import gaussians_from_points
@@ -31,6 +30,5 @@ __all__ = [
     "fuse_views",
     "gaussians_from_points",
     "label_set_from_examples",
-    "merge_gaussians",
     "uplift_maps",
 ]

@@ -8,7 +8,6 @@ import torch
 from kornia.geometry.conversions import rotation_matrix_to_quaternion
 from torch import Tensor
 
-from .._check import check_shapes, check_whole
 from ..gaussians import Gaussians
 from ..quant.grow import group_sums, spherical_kmeans
 from ..splat import covariance_3d
@@ -43,7 +42,7 @@ def merge_gaussians(
     *,
     generator: torch.Generator | None = None,
 ) -> Merged:
-    """Prune and merge Gaussians with features until at most `maximum` are left. Classes are not used.
+    """Prune and merge Gaussians with features until at most `maximum` are left; some weight is not 0. Classes are not used.
 
     If there are more, the faintest Gaussians are dropped, which together have a twentieth of all weight. These are many,
     because a splat has many Gaussians that are hardly visible; their features are noise. The others are merged if they lie
@@ -53,20 +52,10 @@ def merge_gaussians(
     the sum of o_i A_i divided by its A, where A is the product of the two larger standard deviations.
 
     Args:
-        gaussians: N Gaussians with features.
-        weights: of the Gaussians, usually the pixels that each fills in the training views. Those without are dropped.
-        maximum: most Gaussians of the result.
+        weights: usually the pixels that each Gaussian fills in the training views. Those without are dropped.
         generator: draws the first centres of k-means; None: seed 0.
     """
-    check_shapes(("gaussians.means", gaussians.means, "N 3"), ("weights", weights, "N"))
-    check_whole("maximum", maximum, 1)
-    if gaussians.features is None:
-        raise ValueError("gaussians: expected features [N, d], got None; uplift some first")
     rows = (weights > 0).nonzero()[:, 0]
-    if len(rows) == 0:
-        raise ValueError(
-            "weights: expected Gaussians that some view shows, got none; do cameras and Gaussians share one frame?"
-        )
     if len(rows) > maximum:  # all but the smallest weights, which sum to at most this share of all
         order = rows[weights[rows].argsort(stable=True)]
         below = weights[order].double().cumsum(0) <= FAINT * weights.double().sum()

@@ -39,6 +39,7 @@ from .merge import merge_gaussians
 from .semantic_field import SemanticField
 from .working_maps import WorkingMaps, sample_latents, shrink_map
 
+LEFT_OUT = 8  # at most so many views judge a field
 SPARSE = 0.3  # share of the views' pixels: a splat of the scene fills nearly all of them
 NEIGHBOURS = 17  # a Gaussian and its 16 nearest, whose corrections are judged together
 KEEP, MOST = 0.999, 64  # share of the codewords' variation to keep, with at most this many latents
@@ -107,16 +108,12 @@ def uplift_maps(
         progress: show a bar.
 
     Returns:
-        A field with a `Linear` decoder. Latents are all-zero where no view shows the Gaussian. `info["note"]` warns if the
-        Gaussians fill little of the views.
+        A field with a `Linear` decoder. Latents are all-zero where no view shows the Gaussian. `info["explained"]` is what
+        `explained_shares` finds, and `info["note"]` warns if the Gaussians fill little of the views.
 
     Raises:
         ValueError: if counts or shapes disagree, `write_splats` would refuse the Gaussians, a map is not finite, no map has
             features, or no view shows any Gaussian.
-
-    Note:
-        To continue by training, start `fit_field` with `field.gaussians` and the maps
-        `field.decoder.encode(unit features)`.
     """
     config, progress, cameras = config or UpliftConfig(), as_bar(progress), getattr(cameras, "cameras", cameras)
     if (count := len(cameras)) == 0 or count != len(maps):
@@ -151,8 +148,9 @@ def uplift_maps(
             cloud, sums = merged.gaussians, torch.stack([merged.pool(half) for half in sums])
             if config.corrections:
                 sums = correct(cloud, sums, views, bar)
+        info: dict[str, Any] = {"explained": explained_shares(cloud, sums, views)}
     note = f"the Gaussians fill {filled:.0%} of the views; are they in the cameras' frame?"
-    info = {"note": note} if filled < SPARSE else {}
+    info |= {"note": note} if filled < SPARSE else {}
     fused = cloud.replace(features=per_weight(sums.sum(0)))
     return SemanticField(fused, Linear(latents.basis), tuple(cameras), info=info)
 
@@ -194,6 +192,22 @@ def correct(cloud: Gaussians, sums: Tensor, views: WorkingMaps, bar: Any) -> Ten
     nearest = torch.from_numpy(np.asarray(near)).to(cloud.means.device)
     share = reliability(corrections[0], corrections[1], nearest)[:, None]
     return torch.cat([(halves + share * corrections) * weights, weights], dim=-1)
+
+
+def explained_shares(cloud: Gaussians, sums: Tensor, views: WorkingMaps) -> list[float]:
+    """Shares in [0, 1] of the variation of eight views' maps that is explained by the other half of the views, and by their own.
+
+    If only the first is small, depths are wrong or views few; if both are, the teacher contradicts itself from view to view.
+    """
+    halves, lost, whole = per_weight(sums), [0.0, 0.0], EPS
+    for i in range(0, len(views), -(-len(views) // LEFT_OUT) | 1):  # an odd step: of both halves
+        view = views[i]
+        known = ~view.map[..., 0].isnan()
+        whole += float((view.map[known] - view.map[known].mean(0)).square().sum())
+        for k in range(2):
+            shown = rasterize(cloud.replace(features=halves[(i + 1 + k) % 2]), view.camera).map
+            lost[k] += float((shrink_map(shown, view.factor) - view.map)[known].square().sum())
+    return [max(0.0, 1 - part / whole) for part in lost]
 
 
 def reliability(first: Tensor, second: Tensor, near: Tensor) -> Tensor:  # [N, d] x 2, [N, k] -> [N] in [0, 1]

@@ -148,18 +148,13 @@ def _uplift(
     scratch = run.scratch("uplift", seen | {"pixels": options.pixels})
 
     def make(folder: Path) -> None:
-        field = uplift_maps(
-            geometry.to("cpu"),
-            cameras,
-            maps,
-            options,
-            latents=method.latents,
-            generator=run.generator("uplift"),
-            scratch=scratch,
-            progress=run.progress is True,
-        )
+        given, generator = (geometry.to("cpu"), cameras, maps, options), run.generator("uplift")
+        bar = run.progress is True
+        field = uplift_maps(*given, latents=method.latents, generator=generator, scratch=scratch, progress=bar)
+        left_out, own = field.info["explained"]
         run.say(
-            f"{field.dim} channels as {field.decoder.latent} latents; {len(field)} of {len(geometry)} Gaussians left"
+            f"{field.dim} channels as {field.decoder.latent} latents; {len(field)} of {len(geometry)} Gaussians left; they "
+            f"explain {left_out:.0%} of the teacher's variation in views that are left out, {own:.0%} in their own"
         )
         if "note" in field.info:
             run.say(f"note: {field.info['note']}")

@@ -313,6 +313,16 @@ def test_gaussians_that_fill_little_of_the_views_are_pointed_out():
     assert "of the views; are they in the cameras' frame?" in found.info["note"]
 
 
+def test_a_field_says_how_much_of_other_views_it_explains():
+    """Where nothing is drawn, nothing is explained. Two views that contradict each other explain themselves alone."""
+    (gaussians, truth), views = row_of_balls(), side_views()
+    agreeing = [rasterize(gaussians.replace(features=truth), view).map for view in views]
+    left_out, own = uplift_maps(gaussians, views, agreeing).info["explained"]
+    assert 0.4 < left_out == pytest.approx(own, abs=1e-3)
+    left_out, own = uplift_maps(gaussians, views[:2], [agreeing[0], agreeing[1].roll(3, dims=2)]).info["explained"]
+    assert left_out == 0 < 0.4 < own
+
+
 # What the views show of a trained field
 
 DIM = 6
