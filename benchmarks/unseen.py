@@ -22,7 +22,8 @@ The rows of loo and own come from WORDS, a label set with the text embeddings of
 A class is *known* if ade has a word for it, or if another room has it, for loo. Every class of the room is asked and scored;
 what is not known costs points. The second score is the mean IoU over the known classes, of the same label maps.
 
-Both commands continue what was begun. Name a new OUT for other rooms: every head of loo depends on all of them.
+Both commands continue what was begun. Name a new OUT for other rooms: every head of loo depends on all of them. Remove
+OUT/fields to fuse again with another version of kfgs.
 """
 
 from __future__ import annotations
@@ -226,17 +227,17 @@ def score_file(out: Path, teacher: str, room: Room) -> Path:
     return out / "scores" / f"{teacher}-{room.name}.json"
 
 
-def fuse_maps(teacher: str, room: Room, args: argparse.Namespace) -> None:
-    """Add the score of the default field on a teacher's maps."""
-    file = score_file(args.out, teacher, room)
-    score = json.loads(file.read_text(encoding="utf-8"))
-    linked = args.out / "scenes" / teacher / room.name
-    classes = load_label_set(linked / "classes.json", linked / "text.npy")
-    maps = FeatureFolder(args.out / teacher / room.name).of(room.scene, "train")
-    splat = args.colors / room.name / "color.ply"
-    field = fit(room.scene, maps, Uplift(splat), folder=args.out / "fields" / f"{teacher}-{room.name}", seed=0)
-    score["field"] = room.score(lambda i: field.segment(room.scene.cameras[i], classes), score["known"])
-    write_json(file, score)
+def fuse_maps(teacher: str, room: Room, args: argparse.Namespace) -> dict[str, Any]:
+    """The scores of a teacher and of the default field on its maps."""
+    score = json.loads(score_file(args.out, teacher, room).read_text(encoding="utf-8"))
+    run, linked = args.out / "fields" / f"{teacher}-{room.name}", args.out / "scenes" / teacher / room.name
+    if not (run / "score.json").is_file():
+        classes = load_label_set(linked / "classes.json", linked / "text.npy")
+        maps = FeatureFolder(args.out / teacher / room.name).of(room.scene, "train")
+        field = fit(room.scene, maps, Uplift(args.colors / room.name / "color.ply"), folder=run, seed=0)
+        fused = room.score(lambda i: field.segment(room.scene.cameras[i], classes), score["known"])
+        write_json(run / "score.json", fused)
+    return {**score, "field": json.loads((run / "score.json").read_text(encoding="utf-8"))}
 
 
 def table(scores: Sequence[dict[str, Any]]) -> str:
@@ -276,17 +277,13 @@ def main() -> None:
         backbone = load_teacher("dinov2", args.weights, size=SIZE)
         for room in rooms:
             extract_features(backbone, room.scene, args.out / "tokens" / room.name, "all")
-    for teacher in args.teachers:
-        for room in rooms:
-            file = score_file(args.out, teacher, room)
-            score = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
-            if args.command == "maps" and not score:
-                make_maps(teacher, room, rooms, args)
-            if args.command == "table" and "field" not in score:
-                fuse_maps(teacher, room, args)
+    pairs = [(teacher, room) for teacher in args.teachers for room in rooms]
     if args.command == "table":
-        files = [score_file(args.out, teacher, room) for teacher in args.teachers for room in rooms]
-        print(table([json.loads(file.read_text(encoding="utf-8")) for file in files]))
+        print(table([fuse_maps(teacher, room, args) for teacher, room in pairs]))
+    else:
+        for teacher, room in pairs:
+            if not score_file(args.out, teacher, room).is_file():
+                make_maps(teacher, room, rooms, args)
 
 
 if __name__ == "__main__":
