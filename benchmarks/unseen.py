@@ -249,14 +249,15 @@ def table(scores: Sequence[dict[str, Any]]) -> str:
     for teacher, title in TEACHERS.items():
         rows = [score for score in scores if score["teacher"] == teacher]
         pairs = np.array([[[row[what][key] for key in KEYS] for what in ("alone", "field")] for row in rows])
+        part = "{}" if any(row["known"] != row["classes"] for row in rows) else "the same"
         for row, pair in zip(rows, pairs, strict=True):
             cells = [f"{alone:.1f} to {field:.1f}, {field - alone:+.1f}" for alone, field in pair.T]
-            lines.append(f"| {title} | {row['room']} | {' | '.join(cells)} |")
+            lines.append(f"| {title} | {row['room']} | {cells[0]} | {part.format(cells[1])} | {cells[2]} |")
         if len(rows) > 1:
             gains = pairs[:, 1] - pairs[:, 0]
             means = zip(*pairs.mean(0), *(f(gains, 0) for f in (np.mean, np.min, np.max)), strict=True)
             cells = [f"{a:.1f} to {b:.1f}, **{m:+.1f}** ({low:+.1f} to {high:+.1f})" for a, b, m, low, high in means]
-            lines.append(f"| {title} | **mean** | {' | '.join(cells)} |")
+            lines.append(f"| {title} | **mean** | {cells[0]} | {part.format(cells[1])} | {cells[2]} |")
     return "\n".join(lines)
 
 
