@@ -17,7 +17,6 @@ if TYPE_CHECKING:
 
 CHUNK = 65_536  # rows per step: with 200 classes, 50 MB of similarities at a time
 PIXELS = 8192  # latents decoded at once: the decoder's widest layer then holds 32 MB
-LEAD = 1e-4  # of the best score; a smaller one could be rounding (1e-6 of 1,000 products), so the plain computation decides
 
 
 class Classification(NamedTuple):
@@ -73,46 +72,14 @@ def pixel_codewords(
     codewords = torch.full((len(rows),), -1, dtype=torch.int64, device=rows.device)
     shown = torch.arange(len(rows), device=rows.device) if covered is None else covered.reshape(-1).nonzero()[:, 0]
     with torch.no_grad():
-        layers = _score_layers(rows, codebook, autoencoder) if autoencoder is not None and exact else None
         centres = autoencoder.encode(codebook.codewords).to(rows) if autoencoder is not None and not exact else None
         for pixels in shown.split(PIXELS):
-            if layers is not None:  # quick; where two codewords are too close to call, decode and quantise below
-                codewords[pixels], leads = _best_and_lead(layers, rows[pixels])
-                pixels = pixels[~(leads > LEAD)]
             if centres is not None:
                 codewords[pixels] = nearest_rows(rows[pixels], centres, euclidean=True)[0]
             else:
                 features = rows[pixels] if autoencoder is None else autoencoder.decode(rows[pixels])
                 codewords[pixels] = codebook.quantize(features).masked_fill(row_norms(features) <= EPS, -1)
     return codewords.reshape(latents.shape[:-1])
-
-
-def _score_layers(
-    rows: Tensor,  # [n, d]
-    codebook: Codebook,
-    autoencoder: Autoencoder,
-) -> tuple[tuple[Tensor, Tensor], ...] | None:
-    """Linear layers whose largest output is the codeword of a latent; None if the decoder has another type than the rows.
-
-    With a decoder W h + b and unit codewords C, argmax over C (W h) + C b: one layer in place of the last one and of the
-    comparison.
-    """
-    networks: Any = autoencoder.decoder
-    decoder = [(layer.weight.detach(), layer.bias.detach()) for layer in networks]
-    weight, bias = decoder[-1]
-    if weight.dtype != rows.dtype:
-        return None
-    unit = codebook.unit.to(rows)
-    return *decoder[:-1], (unit @ weight, unit @ bias)
-
-
-def _best_and_lead(layers: tuple[tuple[Tensor, Tensor], ...], rows: Tensor) -> tuple[Tensor, Tensor]:  # [n] int64, [n]
-    """Which output of the layers (ReLU between) is largest, and its lead: (largest - second) / largest, 0 if not positive."""
-    for k, (weight, bias) in enumerate(layers):
-        rows = torch.addmm(bias, rows.relu_() if k else rows, weight.T)
-    best, winners = largest(rows)
-    second = rows.scatter_(1, winners[:, None], -torch.inf).amax(dim=1)
-    return winners, torch.where(best > 0, (best - second) / best, 0)
 
 
 def decode_rle(segmentation: dict[str, Any]) -> Tensor:  # [H, W] bool
