@@ -13,7 +13,10 @@ from pathlib import Path
 from typing import Any
 
 import kornia.color
+import kornia.metrics
+import numpy as np
 import torch
+from PIL import Image
 from scipy.spatial import cKDTree
 from surface_density import surface_density
 from torch import Tensor
@@ -27,6 +30,9 @@ from kfgs.evaluation.label_pictures import load_label_map
 from kfgs.gaussians import Gaussians
 from kfgs.scenes import Scene, load_scene
 from kfgs.splat import rasterize
+from kfgs.toy.patterns import Noise
+from kfgs.toy.render import render
+from kfgs.toy.room import build_room
 
 REMOVAL = (
     "kfgs-removal/1: held-out views of a scene with exact labels and surfaces. A Gaussian shows the class if its centre is "
@@ -38,6 +44,11 @@ REMOVAL = (
 RECOLOR = (
     "kfgs-recolor/1: test views of a scene with exact labels. Outside = PSNR of after against before over all pixels of "
     "other classes and channels; inside = share of the class's coloured pixels whose hue is within 20 degrees of the target"
+)
+UNCOVERED = (
+    "kfgs-uncovered/1: the pixels of test views that show the class, after its removal, against the same views of the scene "
+    "without it: one PSNR over all these pixels and channels, and the mean of SSIM (kornia, Gaussian window 11x11 with sigma "
+    "1.5) at them. Untouched = share of the pixels of other classes of which the edit moved no channel by 8/255"
 )
 STEP = 8 / 255  # a channel that moves less is untouched: twice what 8-bit rounding and a JPEG would do
 HUE = 20.0  # degrees
@@ -232,6 +243,71 @@ def score_recolor(
         measured_pixels=colored.value,
         views=len(truth.indices),
     )
+
+
+@dataclass(frozen=True)
+class UncoveredReport:
+    """How the places look that a removed class covered; NaN where nothing was measured."""
+
+    name: str
+    """The class that was removed."""
+    psnr: float
+    """Decibels."""
+    ssim: float
+    untouched_pixels: float
+    """The pixels of other classes that did not change, in [0, 1]."""
+    pixels: int
+    """How many pixels the class covered."""
+    views: int
+    protocol: str = UNCOVERED
+
+    def __str__(self) -> str:
+        return (
+            f"{self.name} removed: {self.psnr:.2f} dB, SSIM {self.ssim:.3f} where it was ({self.pixels:,} pixels of "
+            f"{self.views} views); untouched elsewhere: {self.untouched_pixels:.4f} ({self.protocol.split(':')[0]})"
+        )
+
+
+def score_uncovered(
+    before: Gaussians, after: Gaussians, scene: str | Path, name: str, *, split: str = "test"
+) -> UncoveredReport:
+    """Score what the removal of a class uncovers (protocol `kfgs-uncovered/1`, see `UNCOVERED`).
+
+    Args:
+        before: the colour field.
+        after: the same field without the class.
+        scene: a folder that `make_toy_room` wrote (the room is rendered again, without the class), or `benchmarks/rooms.py`
+            with this class in `without/`.
+        name: the class.
+        split: which views are looked at.
+
+    Raises:
+        FileNotFoundError: if the scene has neither `toy.json` nor `without/`.
+        ValueError: as `score_removal`.
+    """
+    truth = ClassTruth(as_path(scene), name, split)
+    squares, similar, count, untouched = 0.0, 0.0, 0, _Share()
+    for i, (camera, inside, _) in zip(truth.indices, truth.views(), strict=True):
+        old, new = (_picture(cloud, camera) for cloud in (before, after))
+        wanted = _without(truth.folder, truth.scene.stem(i), camera, name)
+        pair = (picture.permute(2, 0, 1)[None] for picture in (new, wanted))
+        squares += float((new - wanted).double().square()[inside].sum())
+        similar += float(kornia.metrics.ssim(*pair, 11)[0].mean(dim=0)[inside].double().sum())
+        count += int(inside.sum())
+        untouched.add((new - old).abs().amax(-1) < STEP, among=~inside)
+    ssim = similar / count if count else math.nan
+    return UncoveredReport(name, _psnr([(squares, 3 * count)]), ssim, untouched.value, count, len(truth.indices))
+
+
+def _without(folder: Path, stem: str, camera: Camera, name: str) -> Tensor:  # [H, W, 3] in [0, 1]
+    """The true picture of a view without a class."""
+    if (folder / "toy.json").is_file():
+        seed = read_json(folder / "toy.json")["config"]["seed"]
+        solids = [solid for solid in build_room(seed) if solid.label != name]
+        picture = render(solids, Noise(np.random.default_rng([seed, 3])), camera)[0]
+    else:
+        picture = np.array(Image.open(folder / "without" / "images" / f"{stem}.png"))
+    return torch.from_numpy(picture).float() / 255
 
 
 class ClassTruth:

@@ -2,20 +2,24 @@
 
 python benchmarks/edits.py toy DEMO                   # DEMO: what `kfgs demo --out DEMO` wrote
 python benchmarks/edits.py real ROOM_0 FIELD COLOR    # FIELD: RUN/field.kfgs, COLOR: a splat in the same frame
+python benchmarks/edits.py uncovered CLASS SCENE LABELLED [SCENE LABELLED ...]    # LABELLED: a splat from `kfgs attach`
 
 Prints which rule labels the colour cloud best (mIoU, and mIoU weighted by what each Gaussian shows), and, for the toy room,
-the removal and the recolouring of every class (`kfgs-removal/1`, `kfgs-recolor/1`).
+the removal and the recolouring of every class (`kfgs-removal/1`, `kfgs-recolor/1`). `uncovered` removes one class, without
+and with `fill`, and compares with the scene without it (`kfgs-uncovered/1`): a toy room (DEMO/scene, DEMO/color.ply), or a
+room of benchmarks/rooms.py.
 """
 
 from __future__ import annotations
 
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import torch
-from editing import score_recolor, score_removal
+from editing import score_recolor, score_removal, score_uncovered
 from scipy.spatial import cKDTree
 from torch import Tensor
 
@@ -122,10 +126,37 @@ def real(folder: Path, field_path: Path, color: Path) -> None:
     compare_views(field, splats, truth, shown, classes, cameras)
 
 
+def uncovered(name: str, pairs: list[tuple[Path, Path]]) -> None:
+    """What a class covered, in one or several scenes; the mean of several comes last."""
+    print("scene | rule | PSNR | SSIM | untouched | Gaussians more | seconds")
+    rows: dict[str, list[list[float]]] = {}
+    for folder, labelled in pairs:
+        before = read_splats(labelled)
+        rules = {"as it was": EditList()} | {f"fill={fill}": EditList((Remove(name, fill),)) for fill in (False, True)}
+        for rule, edits in rules.items():
+            started = time.perf_counter()
+            after = edits.apply(before)
+            seconds, score = time.perf_counter() - started, score_uncovered(before, after, folder, name)
+            row = [score.psnr, score.ssim, score.untouched_pixels, len(after) - len(before), seconds]
+            rows.setdefault(rule, []).append(row)
+            print(
+                f"{folder} | {rule} | {row[0]:.2f} | {row[1]:.3f} | {row[2]:.4f} | {row[3]:+,} | {row[4]:.1f}",
+                flush=True,
+            )
+    if len(pairs) > 1:
+        for rule, table in rows.items():
+            mean, spread = np.mean(table, axis=0), np.std(table, axis=0, ddof=1)
+            shown = " | ".join(f"{m:.3f} +- {s:.3f}" for m, s in zip(mean[:3], spread[:3], strict=True))
+            print(f"mean of {len(pairs)} | {rule} | {shown}")
+
+
 if __name__ == "__main__":
     if sys.argv[1:2] == ["toy"] and len(sys.argv) == 3:
         toy(Path(sys.argv[2]))
     elif sys.argv[1:2] == ["real"] and len(sys.argv) == 5:
         real(*map(Path, sys.argv[2:]))
+    elif sys.argv[1:2] == ["uncovered"] and len(sys.argv) >= 5 and len(sys.argv) % 2 == 1:
+        paths = list(map(Path, sys.argv[3:]))
+        uncovered(sys.argv[2], list(zip(paths[::2], paths[1::2], strict=True)))
     else:
         raise SystemExit(__doc__)

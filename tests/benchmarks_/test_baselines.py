@@ -2,14 +2,14 @@
 
 import pytest
 import torch
-from baselines import cf3, feature_3dgs, langsplat, langsplatv2, legaussians, occam, plain_uplift
+from baselines import cf3, feature_3dgs, langsplat, langsplatv2, legaussians, occam
 from baselines.methods import LabelMaps, LinearDecoder, RenderedMethod
 from small_task import MIB, cameras, cloud, task
 
 from kfgs._rows import unit_rows
 from kfgs.cameras import resize_map
 from kfgs.evaluation import View
-from kfgs.splat import average_views, covariance_3d, rasterize
+from kfgs.splat import covariance_3d, rasterize
 
 LEARNS_CODES = legaussians.LEGaussiansConfig(
     codes=4, epochs=150, code_rate=1e-2, steps=150, feature_rate=2e-2, network_rate=1e-2
@@ -65,18 +65,6 @@ def test_cf3_merges_two_gaussians_into_the_moments_of_their_mixture():
     assert float(merged.opacities[1]) == pytest.approx(float(0.25 * one.opacities[0] + 0.75 * one.opacities[2]))
 
 
-def test_cf3_pairs_need_like_features_and_nearness():
-    means = torch.tensor([[0.0, 0, 0], [0.05, 0, 0], [3.0, 0, 0], [3.05, 0, 0]])
-    features = torch.tensor([[1.0, 0, 0], [1, 0.01, 0], [1, 0, 0], [0, 1, 0]])
-    one, everyone = cloud(4).replace(means=means, features=features), torch.ones(4, dtype=torch.bool)
-    assert cf3.find_pairs(one, 0.9, everyone).tolist() == [[0, 1]]  # 2 and 3 are near, but unlike
-    assert cf3.find_pairs(one, 0.9, torch.tensor([True, False, True, True])).tolist() == []
-    assert cf3.find_pairs(one.replace(means=100 * means), 0.9, everyone).tolist() == []
-    found = cf3.fit(task(), cf3.CF3Config(epochs=20, batch=8, rounds=2, steps=10))
-    assert found.own_geometry
-    assert len(found.method.gaussians) <= 12
-
-
 def test_langsplat_losses_against_numbers_and_unit_latents():
     out, wanted = torch.tensor([[1.0, 0.0], [0.0, 1.0]]), torch.tensor([[1.0, 0.0], [1.0, 0.0]])
     # MSE = 2 / 4; cosines of rows 1 and 0; of columns (1,0).(1,1) = 1/sqrt 2 and (0,1).(0,0) = 0
@@ -130,17 +118,6 @@ def test_occam_takes_the_renderers_weights_at_the_centres_and_averages_unit_feat
     assert torch.allclose(weights, total, atol=1e-5)
     assert torch.allclose(found[total > 0], (sums / total[:, None])[total > 0], atol=1e-5)
     assert not found[total == 0].any()
-
-
-def test_plain_uplift_is_the_mean_by_rendering_weight():
-    one = task()
-    found = plain_uplift.fit(one, plain_uplift.PlainUpliftConfig(keep=1.0))
-    maps = [resize_map(unit_rows(map), camera.size) for map, camera in zip(one.maps, one.cameras, strict=True)]
-    wanted = average_views(one.geometry, zip(one.cameras, maps, strict=True)).values
-    decoded = found.tensors["features"] @ found.tensors["basis"].T
-    cosines = (unit_rows(decoded) * unit_rows(wanted)).sum(1)
-    assert float(cosines[wanted.any(dim=1)].min()) > 0.99
-    assert torch.equal(decoded.any(dim=1), wanted.any(dim=1))
 
 
 def method_of(matrix=None, bias=None):

@@ -11,7 +11,6 @@ from PIL import Image
 from published.class_lists import load_classes
 from published.mask_truth import MaskTruth
 from published.truth.find import find_masks
-from published.truth.legaussians import load_legaussians
 from published.truth.lerf_ovs import load_lerf_ovs
 from published.truth.ovs3d import load_3dovs
 
@@ -92,19 +91,6 @@ def _legaussians(folder: Path, scene: str = "kitchen") -> Path:
     for i, view in enumerate(LEGAUSSIANS["views"][scene]):
         _mask(folder / scene / "segmentations" / view / f"{texts[i % len(texts)]}.png", (1, 2, 3, 4))
     return folder / scene
-
-
-def test_legaussians(tmp_path: Path) -> None:
-    folder = _legaussians(tmp_path)
-    _mask(folder / "segmentations/DSCF0660/Wood plat.png", (0, 0, 12, 10))
-    _mask(folder / "segmentations/DSCF9999/Wood plat.png", (0, 0, 12, 10))
-    truth = load_legaussians(folder)
-    assert list(truth.frames) == LEGAUSSIANS["views"]["kitchen"]
-    assert list(truth.frames["DSCF0660"]) == ["LEGO Technic 856 Bulldozer", "Wood plat"]
-    assert bool(truth.frames["DSCF0660"]["Wood plat"].mask.all())
-    assert len(load_legaussians(tmp_path, "kitchen").frames) == 28
-    folder.rename(tmp_path / "mine")
-    assert len(load_legaussians(tmp_path / "mine").frames) == 29  # of an unknown scene, what is there
 
 
 def test_masks_are_found_by_their_files(tmp_path: Path) -> None:

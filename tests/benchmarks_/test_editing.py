@@ -4,9 +4,12 @@ import json
 import math
 
 import pytest
-from editing import score_recolor, score_removal
+import torch
+from editing import _without, score_recolor, score_removal, score_uncovered
 from oracles_editing import paint_room
+from PIL import Image
 
+from kfgs.evaluation.label_pictures import load_label_map
 from kfgs.labels.color import recolor
 from kfgs.scenes import load_scene
 from kfgs.toy.room_folder import ToyConfig, make_toy_room
@@ -43,6 +46,29 @@ def test_removal_by_true_labels_is_near_one(room, cloud, mask, name):
     assert report.changed_pixels > 0.97
     assert report.measured_pixels > 0.9
     assert report.views == 2
+
+
+def test_uncovered_pixels_are_compared_with_the_room_without_the_class(room, cloud, tmp_path):
+    scene, names = load_scene(room), json.loads((room / "classes.json").read_text())
+    black = cloud.select([0]).replace(opacities=cloud.opacities[:1] * 0 + 1e-6)
+    report = score_uncovered(cloud, black, room, "chair")
+    (tmp_path / "without" / "images").mkdir(parents=True)
+    squares, same = [], []
+    for i in scene.views("test"):
+        truth = _without(room, scene.stem(i), scene.cameras[i], "chair")
+        Image.fromarray((truth * 255).round().byte().numpy()).save(
+            tmp_path / "without" / "images" / f"{scene.stem(i)}.png"
+        )
+        chair = load_label_map(room / "labels" / f"{scene.stem(i)}.png") == names.index("chair")
+        squares.append(truth[chair].square())
+        same.append(((truth - scene.image(i)).abs() < 2 / 255).all(dim=-1)[~chair])
+    assert report.psnr == pytest.approx(-10 * math.log10(float(torch.cat(squares).mean())), abs=1e-4)
+    assert report.pixels == sum(map(len, squares)) > 1_000
+    assert 0.8 < float(torch.cat(same).float().mean()) < 1  # all but the chairs' shadows
+    assert report.untouched_pixels < 0.1
+    for name in ("images", "labels", "sparse", "classes.json", "split.json"):  # a room of benchmarks/rooms.py
+        (tmp_path / name).symlink_to(room / name)
+    assert score_uncovered(cloud, black, tmp_path, "chair") == report
 
 
 def test_edits_of_nothing_and_of_a_wrong_class_do_not_pass(room, cloud, mask):

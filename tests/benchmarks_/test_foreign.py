@@ -27,7 +27,6 @@ from published.foreign import (
     load_langsplat,
     load_langsplat_v2,
     load_legaussians_field,
-    load_occam,
     load_splat_features,
 )
 from torch import nn
@@ -139,29 +138,6 @@ def test_langsplat_v2(tmp_path: Path) -> None:
     assert load_langsplat_v2([path], top=2).parts[0].values.count_nonzero(1).tolist() == [2] * N
     two = save_capture(tmp_path / "two/chkpnt10000.pth", [logits, torch.cat([book, book])])
     refused(lambda: load_langsplat_v2(two), "chkpnt10000.pth", "one codebook [1, 16, D]", "[2, 16, 9]", "vq_layer_num")
-
-
-def test_occam_whose_levels_lost_other_gaussians(tmp_path: Path) -> None:
-    features, text, kept = random_rows(N, 10), random_rows(K, 10, seed=5), [[0, 1, 2, 5, 7], [1, 3, 5, 11]]
-    for level, rows in enumerate(kept, 1):
-        raw = {name: value[rows] for name, value in raw_values().items()}
-        save_capture(tmp_path / f"chkpnt30000_langfeat_{level}.pth", [features[rows]], raw=raw)
-    method = load_occam(tmp_path)
-    assert (method.name, method.levels, len(method.gaussians)) == ("Occam's LGS", 2, 7)
-    assert torch.equal(method.gaussians.means, raw_values()["xyz"][[0, 1, 2, 5, 7, 3, 11]])
-    own = method.gaussian_cosines(text)
-    for level, rows in enumerate(kept):
-        raw = {name: value[rows] for name, value in raw_values().items()}
-        shown, seen = rendered(features[rows], raw)
-        expected = np.where(seen[..., None], cosines_of(shown, text.double().numpy()), np.nan)
-        np.testing.assert_allclose(method.cosines(VIEW, text)[level].numpy(), expected, atol=2e-5)
-        exact = cosines_of(features.numpy(), text.double().numpy())
-        expected = np.array([exact[i] if i in rows else [np.nan] * K for i in (0, 1, 2, 5, 7, 3, 11)])
-        np.testing.assert_allclose(own[level].numpy(), expected, atol=2e-5)
-    assert load_occam(tmp_path / "chkpnt30000_langfeat_2.pth").levels == 1
-    assert load_foreign(tmp_path).levels == 2
-    assert load_foreign(tmp_path / "chkpnt30000_langfeat_2.pth").levels == 1
-    refused(lambda: load_foreign(tmp_path, tmp_path / "x.pth"), "with_file", "none with Occam")
 
 
 @pytest.mark.parametrize("kind", ["checkpoint", "ply"])

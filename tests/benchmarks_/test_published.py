@@ -7,14 +7,13 @@ import cases_methods as cases
 import numpy as np
 import pytest
 import torch
-from messages import refused
 from published.class_lists import load_classes
 from published.legaussians_masks import LEGaussiansMasks
 from published.lerf_2d import LerfOvs2D
 from published.lerf_3d import LerfOvs3D
 from published.mask_truth import MaskAndBoxes, MaskTruth
 from published.ovs3d import OVS3DClosed, OVS3DStability, OVS3DThreshold
-from published.scannet_points import ScanNetPoints, class_indices, scannet_classes
+from published.scannet_points import ScanNetPoints, scannet_classes
 from published.scannet_volume import ScanNetVolume
 from published.scenesplat import SceneSplatBench, match_names
 
@@ -196,13 +195,6 @@ def test_several_scenes_of_scenesplat_share_one_matrix(options, both, first):
     assert list(alone.scores.values()) == pytest.approx(first, abs=2e-6)
 
 
-def test_holicity_asks_six_prompts_for_four_classes():
-    prompts = [prompt for prompt, _ in LISTS["holicity4"]["prompts"]]
-    method, truth = scenesplat(3, prompts, LISTS["holicity4"]["classes"])
-    report = SceneSplatBench(benchmark="holicity4", neighbours=4).score(method, truth, (), method.encode)
-    assert list(report.scores.values()) == pytest.approx([0.145991, 0.245833, 0.145991, 0.245833, 0.25], abs=2e-6)
-
-
 @pytest.mark.parametrize(("name", "ceiling"), [("scannet20", -1), ("matterport21", 20)])
 def test_all_names_of_scannet_find_their_class(name, ceiling):
     # ids of NYU40: wall, showercurtain, otherfurniture, ceiling, blinds (twice), none, not in the table
@@ -210,13 +202,3 @@ def test_all_names_of_scannet_find_their_class(name, ceiling):
     found = match_names(truth, LISTS[name]["classes"])
     assert found.labels.tolist() == [0, 15, 19, ceiling, -1, -1, -1, -1]
     assert found.left_out == ({"blinds": 2} if ceiling == 20 else {"blinds": 2, "ceiling": 1})
-
-
-def test_classes_are_opengaussians():
-    assert [len(scannet_classes(count)[0]) for count in (19, 15, 10)] == [19, 15, 10]
-    assert set(scannet_classes(10)[0]) < set(scannet_classes(15)[0]) < set(scannet_classes(19)[0])
-    assert dict(zip(*scannet_classes(19), strict=True))[28] == "showercurtain"
-    assert class_indices(torch.tensor([4, 0, 2, 39]), [2, 4]).tolist() == [1, -1, 0, -1]
-    refused(lambda: ScanNetPoints(classes=20), "classes: expected one of 19, 15, 10")
-    with pytest.raises(ValueError, match="expected 90 Gaussians .one at each vertex of truth.points., got 60"):
-        ScanNetPoints().score(*scannet(1, 90), scannet(1, 90)[0].encode)
