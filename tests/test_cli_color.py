@@ -163,9 +163,10 @@ def test_edits_are_replayed_to_the_same_bytes_from_anywhere(labelled, tmp_path, 
     arguments = ["edit", str(labelled), "--out", str(again), "--replay", str(tmp_path / "b" / "e.ply.edits.json")]
     assert main(arguments) == 0
     assert again.read_bytes() == whole.read_bytes()
-    assert main([*arguments, "--remove", "chair"]) == 0
+    assert main([*arguments, "--remove", "chair:fill"]) == 0
+    assert "new Gaussians continue the surfaces" in capsys.readouterr().out
     edits = json.loads((tmp_path / "c" / "e.ply.edits.json").read_text())["edits"]
-    assert [edit["op"] for edit in edits] == ["move", "remove", "remove"]
+    assert [(edit["op"], edit.get("fill")) for edit in edits] == [("move", None), ("remove", None), ("remove", True)]
 
 
 def test_convert_by_class_writes_a_plain_file_for_each_class(labelled, tmp_path, capsys):

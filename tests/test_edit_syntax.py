@@ -15,11 +15,9 @@ def test_each_option_is_the_edit_it_says():
     assert read(recolor=["plant:#ff0080"]) == [Recolor(OfClass("plant"), (1.0, 0.0, 128 / 255))]
     assert read(move=["table:0.5,0,-2e-1"]) == [Move(OfClass("table"), (0.5, 0.0, -0.2))]
     assert read(remove=["window blind", "chair"]) == [Remove(OfClass("window blind")), Remove(OfClass("chair"))]
+    both = Remove([OfClass("chair", 0), OfClass("chair", 1)], fill=True)
+    assert read(remove=["chair/1", "rug", "chair/2:fill"]) == [both, Remove(OfClass("rug"))]
     assert read(extract=["rug", "sofa"]) == [Extract([OfClass("rug"), OfClass("sofa")])]
-
-
-def test_nothing_asked_is_no_edit():
-    assert read() == []
 
 
 def test_the_order_does_not_depend_on_the_line():
@@ -28,10 +26,6 @@ def test_the_order_does_not_depend_on_the_line():
     edits = read(**words)
     assert [edit.op for edit in edits] == expected
     assert [edit.where[0].name for edit in edits[:4]] == ["h", "i", "d", "b"]
-
-
-def test_a_class_asked_twice_is_removed_once():
-    assert read(remove=["chair", "chair"]) == [Remove(OfClass("chair"))]
 
 
 def test_a_class_asked_in_other_case_is_removed_with_it():

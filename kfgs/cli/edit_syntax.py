@@ -23,7 +23,7 @@ class Edits:
     move: Several = ()
     """A class and a translation in world units, "table:0.5,0,0"."""
     remove: Several = ()
-    """A class, "chair", or a part of it, "chair/2"."""
+    """A class, "chair", or a part of it, "chair/2"; "chair:fill" also continues the surfaces around through the hole."""
     extract: Several = ()
     """Keep only these classes, or parts of them."""
 
@@ -60,11 +60,11 @@ def parse_edits(asked: Edits, names: Sequence[str] = ()) -> list[Any]:
         if len(numbers) != 3 or not all(map(math.isfinite, numbers)):
             raise ValueError(f"move: expected 3 numbers between commas after the colon, got {words!r}; write it so")
         edits.append(Move(where("move", name), numbers))
-    removed: dict[str, list[OfClass]] = {}  # by class: removing one part changes the numbers of the others
+    removed: dict[str, list[tuple[OfClass, bool]]] = {}  # by class: removing one part changes the numbers of the others
     for words in dict.fromkeys(asked.remove):
-        rule = where("remove", words)
-        removed.setdefault(str(rule.name).casefold(), []).append(rule)
-    edits += [Remove(rules) for rules in removed.values()]
+        rule = where("remove", name := words if words.casefold() in known else words.removesuffix(":fill"))
+        removed.setdefault(str(rule.name).casefold(), []).append((rule, name != words))
+    edits += [Remove([rule for rule, _ in rules], any(fill for _, fill in rules)) for rules in removed.values()]
     if asked.extract:
         edits.append(Extract([where("extract", words) for words in asked.extract]))
     return edits

@@ -21,6 +21,7 @@ from ..cameras.similarity import Similarity
 from ..gaussians import Gaussians
 from ..splat.transform import transform_gaussians
 from .color import parse_color, recolor
+from .fill import fill_holes
 from .selection import Rule, Selection, as_rule, as_selection, class_names, plain_fields, set_fields, three_numbers
 from .transfer import INSTANCE, as_cloud
 
@@ -81,9 +82,16 @@ class Remove(OnSelection):
     """Remove Gaussians ("delete the chair")."""
 
     op: ClassVar[str] = "remove"
+    fill: bool = False
+    """Whether to continue the flat surfaces around it through the hole, as new Gaussians (`labels/fill.py`)."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not isinstance(self.fill, bool):
+            raise TypeError(f"fill: expected True or False, got {self.fill!r:.80}; leave it out to fill nothing")
 
     def _change(self, gaussians: Gaussians, mask: Tensor) -> Gaussians:
-        return gaussians.select(~mask)
+        return fill_holes(gaussians, mask) if self.fill else gaussians.select(~mask)
 
 
 @dataclass(frozen=True)

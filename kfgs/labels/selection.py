@@ -300,7 +300,7 @@ def set_fields(frozen: Any, **values: Any) -> None:
 def plain_fields(value: Any) -> dict[str, Any]:
     """The fields of a rule or an edit by name, as values for JSON; `read_object` reads them."""
     values = {member.name: getattr(value, member.name) for member in fields(value)}
-    return {name: _plain(member) for name, member in values.items() if member is not None}
+    return {name: _plain(member) for name, member in values.items() if member is not None and member is not False}
 
 
 def _plain(value: Any) -> Any:

@@ -84,7 +84,8 @@ def run(
     say(f"surface points: {surface}")
     say(
         f'5. Edits. The classes are carried over to the splat with the colours, and then "{REMOVED}" is a name for Gaussians: '
-        f"the {REMOVED}s are removed, and the {PAINTED}s are painted red. Pictures show the views that change most."
+        f"the {REMOVED}s are removed, and the {PAINTED}s are painted red. What nobody saw behind a {REMOVED} is invented: the "
+        "floor around it continues (fill). Pictures show the views that change most."
     )
     edited = _edit_colors(out, scene, field, colors, say)
     reports: dict[str, Any] = {"unseen_views": scores, "teacher": teacher, "surface": surface, "color": quality}
@@ -111,7 +112,7 @@ def _edit_colors(
     written = write_splats(before, out / "color.ply").paths
     for part in connected_parts(before, OfClass(REMOVED).select(before), field.cameras):
         say(f"  {REMOVED}: {part!r}")
-    for name, edit in {"removed": Remove(REMOVED), "recolored": Recolor(PAINTED, PAINT)}.items():
+    for name, edit in {"removed": Remove(REMOVED, fill=True), "recolored": Recolor(PAINTED, PAINT)}.items():
         after, file = edit.apply(before), out / f"{name}.ply"
         written += [*write_splats(after, file).paths, EditList((edit,)).save(out / f"{name}.ply.edits.json")]
         views = [scene.cameras[i] for i in views_of_change(before, after, scene.cameras)]

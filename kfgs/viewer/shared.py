@@ -22,7 +22,7 @@ from .pack import pack_camera
 from .session import EDITS, edit_list, labelled
 from .state import Exploration, Picked, Side
 
-USUAL = (("scale", 1),)  # of edits that the browser does
+USUAL = (("scale", 1), ("fill", False))  # of edits that the browser does
 NAMES = ("question", "gamma", "distance", "hidden", "side", "selection", "edits", "picked", "tape", "camera")
 
 
@@ -238,7 +238,7 @@ def _numbered(edits: Iterable[Edit], cloud: Gaussians) -> list[dict[str, Any]]:
         plain = {key: part for key, part in edit.to_json().items() if key != "pivot"}
         if edit.op not in EDITS or "rotation" in plain or any(plain.get(key, usual) != usual for key, usual in USUAL):
             raise ValueError(
-                f"edits[{place}]: expected {', '.join(EDITS)} (without rotation and scale), got {edit!r:.80}; "
+                f"edits[{place}]: expected {', '.join(EDITS)} (without rotation, scale and fill), got {edit!r:.80}; "
                 "apply it to the Gaussians, and explore the result"
             )
         mask = as_selection(edit.where, cloud).mask  # type: ignore[attr-defined]

@@ -58,7 +58,7 @@ D, d, K = 16, 4, 6
 
 
 def decoder(bias=0.1, seed=0):
-    """A decoder of layers, whose last one and the comparison with codewords are one layer on the CPU."""
+    """A decoder of three layers."""
     g = torch.Generator().manual_seed(seed)
     widths = d, 24, 40, D
     layers = tuple(
@@ -69,7 +69,7 @@ def decoder(bias=0.1, seed=0):
 
 
 def plainly(latents, codebook, autoencoder):
-    """Every latent decoded, and the codeword most similar to it: the slow path."""
+    """Every latent decoded, and the codeword most similar to it."""
     features = autoencoder.decode(latents)
     return codebook.quantize(features).masked_fill(torch.linalg.vector_norm(features, dim=-1) <= 1e-8, -1)
 

@@ -222,7 +222,7 @@ def test_edits_that_are_set_are_numbered_as_in_the_browser(viewer):
     assert set(viewer.selection.indices.tolist()) == set(range(450)) - removed
     viewer.edits = viewer.edits.undo()
     assert ops[:-1] == [edit["op"] for edit in viewer.wire["sides"]["color"]["edits"]]
-    wrong = Move("chair", rotation=("z", 90)), Opacity("lamp", 0.5)
+    wrong = Move("chair", rotation=("z", 90)), Remove("chair", fill=True), Opacity("lamp", 0.5)
     before = viewer.wire
     for edit in wrong:
         with pytest.raises(ValueError, match=r"edits\[0\]|class"):
