@@ -197,7 +197,7 @@ def draw_errors(demo: Demo) -> None:
 
 def draw_landing(demo: Demo) -> None:
     """Photo, classes, a query, and an edited scene."""
-    edited = EditList().then(Remove("chair")).then(Recolor("plant", "#c04040")).apply(demo.splat)
+    edited = EditList().then(Remove("chair", fill=True)).then(Recolor("plant", "#c04040")).apply(demo.splat)
     asked = demo.field.query("chair", demo.words).mask
     pictures = [
         demo.photo(),

@@ -53,9 +53,9 @@ def fill_holes(gaussians: Gaussians, mask: Tensor) -> Gaussians:  # mask: [N] bo
     cloud, mask = gaussians.detach().to("cpu", torch.float32).replace(origin=ORIGIN), mask.cpu()
     kept, part = cloud.select(~mask), number_parts(cloud, mask)[mask].numpy()
     points, thing = positions("gaussians.means", kept.means), positions("gaussians.means", cloud.means[mask])
-    parts = np.unique(part[part >= min(part.max(), 0)])  # -1: specks of no thing
-    sizes = [np.ptp(np.quantile(thing[part == i], (0.05, 0.95), axis=0), axis=0).max() for i in parts]
-    size, tree = float(np.median(sizes)), cKDTree(thing)
+    names, which = np.unique(part, return_inverse=True)
+    sizes = np.array([np.ptp(np.quantile(thing[part == i], (0.05, 0.95), axis=0), axis=0).max() for i in names])
+    size, tree = float(np.median(sizes[which])), cKDTree(thing)  # most parts may be specks: the median over Gaussians
     near = np.isfinite(tree.query(points, distance_upper_bound=NEAR * size)[0])
     new, hidden = [], np.zeros(len(points), bool)
     if near.any():

@@ -1,7 +1,6 @@
 """Removal with `fill`: a floor of known height and colours under a box, whose hole is closed and nothing else."""
 
 import json
-from dataclasses import replace
 
 import pytest
 import torch
@@ -29,10 +28,11 @@ def patch(low, high, label, color, step=0.05):
 
 
 def room():
-    """A floor, half red and half blue, with a hole in its middle, on which a box stands."""
+    """A floor, half red and half blue, with a hole in its middle, on which a box stands; and specks labelled as the box."""
     floor = Gaussians.cat([patch((-1, -1, 0), (-0.03, 1, 0), 0, RED), patch((0.02, -1, 0), (1, 1, 0), 0, BLUE)])
     floor = floor.select(floor.means[:, :2].abs().amax(1) > 0.3)
-    return Gaussians.cat([floor, patch((-0.2, -0.2, 0), (0.2, 0.2, 0.4), 1, GREEN)])
+    specks = patch((-0.9, 0.9, 1.0), (0.9, 0.9, 1.0), 1, GREEN, step=0.3)
+    return Gaussians.cat([floor, patch((-0.2, -0.2, 0), (0.2, 0.2, 0.4), 1, GREEN), specks])
 
 
 def test_the_floor_continues_under_the_box():
@@ -68,7 +68,7 @@ def test_without_a_surface_nothing_is_invented():
 def test_the_same_again_elsewhere_and_in_float64():
     once, again = EDIT.apply(room()), EDIT.apply(room())
     assert all(torch.equal(a, b) for a, b in zip(once.tensors().values(), again.tensors().values(), strict=True))
-    far = EDIT.apply(replace(room().to(torch.float64), origin=(5e5, 4e6, 0.0)))
+    far = EDIT.apply(room().to(torch.float64).replace(origin=(5e5, 4e6, 0.0)))
     assert (far.means.dtype, far.origin) == (torch.float64, (5e5, 4e6, 0.0))
     assert torch.allclose(far.means.float(), once.means, atol=1e-5)
 
