@@ -277,8 +277,8 @@ def score_uncovered(
         before: the colour field.
         after: the same field without the class.
         scene: a folder that `make_toy_room` wrote (the room is rendered again, without the class), or `benchmarks/rooms.py`
-            with this class in `without/`.
-        name: the class.
+            whose `without/` lacks what is named.
+        name: the class, or several between commas.
         split: which views are looked at.
 
     Raises:
@@ -303,7 +303,7 @@ def _without(folder: Path, stem: str, camera: Camera, name: str) -> Tensor:  # [
     """The true picture of a view without a class."""
     if (folder / "toy.json").is_file():
         seed = read_json(folder / "toy.json")["config"]["seed"]
-        solids = [solid for solid in build_room(seed) if solid.label != name]
+        solids = [solid for solid in build_room(seed) if solid.label not in name.split(",")]
         picture = render(solids, Noise(np.random.default_rng([seed, 3])), camera)[0]
     else:
         picture = np.array(Image.open(folder / "without" / "images" / f"{stem}.png"))
@@ -311,20 +311,23 @@ def _without(folder: Path, stem: str, camera: Camera, name: str) -> Tensor:  # [
 
 
 class ClassTruth:
-    """The pixels that show a class in the views of a split."""
+    """The pixels that show a class, or one of several ("table,bottle"), in the views of a split."""
 
     def __init__(self, folder: Path, name: str, split: str) -> None:
-        names = read_json(folder / "classes.json")
-        if name not in names:
+        names, parts = read_json(folder / "classes.json"), name.split(",")
+        if not set(parts) <= set(names):
             raise ValueError(f"name: expected one of {', '.join(names)} (classes of {folder}), got {name!r}")
-        self.folder, self.label = folder, names.index(name)
+        self.folder, self.label, self.labels = folder, names.index(parts[0]), [names.index(part) for part in parts]
         self.scene: Scene = load_scene(folder)
         self.indices = tuple(self.scene.views(split))
-        if not any(bool((self._labels(i) == self.label).any()) for i in self.indices):
+        if not any(bool(self._inside(i).any()) for i in self.indices):
             raise ValueError(
                 f"name: expected a class that is seen in some of the {len(self.indices)} views of {split!r}, got {name!r}, "
                 "which none shows; choose another class or split"
             )
+
+    def _inside(self, i: int) -> Tensor:  # [H, W] bool
+        return torch.isin(self._labels(i), torch.tensor(self.labels))
 
     def _labels(self, i: int) -> Tensor:  # [H, W] int64
         path, camera = self.folder / "labels" / f"{self.scene.stem(i)}.png", self.scene.cameras[i]
@@ -336,7 +339,7 @@ class ClassTruth:
     def views(self) -> Iterator[tuple[Camera, Tensor, Tensor]]:  # [H, W] bool, [H, W] bool
         """Each camera, the pixels of the class, and those at least BORDER pixels away; without masked or transparent ones."""
         for i in self.indices:
-            inside, camera = self._labels(i) == self.label, self.scene.cameras[i]
+            inside, camera = self._inside(i), self.scene.cameras[i]
             grown = torch.nn.functional.max_pool2d(inside[None].float(), 2 * BORDER + 1, 1, BORDER)[0] > 0
             counted = self.scene.counted(i, camera.size)
             counted = torch.ones_like(inside) if counted is None else counted

@@ -5,9 +5,9 @@ python benchmarks/edits.py real ROOM_0 FIELD COLOR    # FIELD: RUN/field.kfgs, C
 python benchmarks/edits.py uncovered CLASS SCENE LABELLED [SCENE LABELLED ...]    # LABELLED: a splat from `kfgs attach`
 
 Prints which rule labels the colour cloud best (mIoU, and mIoU weighted by what each Gaussian shows), and, for the toy room,
-the removal and the recolouring of every class (`kfgs-removal/1`, `kfgs-recolor/1`). `uncovered` removes one class, without
-and with `fill`, and compares with the scene without it (`kfgs-uncovered/1`): a toy room (DEMO/scene, DEMO/color.ply), or a
-room of benchmarks/rooms.py.
+the removal and the recolouring of every class (`kfgs-removal/1`, `kfgs-recolor/1`). `uncovered` removes a class (or several:
+table,bottle), without and with `fill`, and compares with the scene without it (`kfgs-uncovered/1`): a toy room (DEMO/scene,
+DEMO/color.ply), or a room of benchmarks/rooms.py.
 """
 
 from __future__ import annotations
@@ -132,7 +132,9 @@ def uncovered(name: str, pairs: list[tuple[Path, Path]]) -> None:
     rows: dict[str, list[list[float]]] = {}
     for folder, labelled in pairs:
         before = read_splats(labelled)
-        rules = {"as it was": EditList()} | {f"fill={fill}": EditList((Remove(name, fill),)) for fill in (False, True)}
+        rules = {"as it was": EditList()} | {
+            f"fill={fill}": EditList((Remove(name.split(","), fill),)) for fill in (False, True)
+        }
         for rule, edits in rules.items():
             started = time.perf_counter()
             after = edits.apply(before)
