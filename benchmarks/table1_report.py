@@ -1,8 +1,12 @@
-"""Table 1 as text and as pictures, from the results of its rows."""
+"""Table 1 as text and as pictures, from the results of its rows; and several tables as one.
+
+python benchmarks/table1_report.py OUT1 OUT2 ...      # of table1.py, one per room: mIoU by room, mean and range over rooms
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import sys
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from statistics import mean, median
 from typing import Any
@@ -11,7 +15,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from table1_rows import ROWS, fitting_seconds
 
-from kfgs._files import atomic_path, write_json
+from kfgs._files import atomic_path, read_json, write_json
 from kfgs.evaluation.label_pictures import load_label_map
 from kfgs.labels import load_label_set
 from kfgs.metrics import MIB
@@ -102,6 +106,25 @@ def cells(title: str, paper: dict[str, Any] | None, found: list[dict[str, Any]])
     ]  # fmt: skip
 
 
+def rooms_text(folders: Sequence[Path]) -> str:
+    """Each row's mIoU by room, as the mean over seeds, and the mean and range over rooms if every room has the row."""
+    reports = [read_json(folder / "table1.json") for folder in folders]
+    names = [Path(report["rows"][0]["request"]["scene"]).name for report in reports]
+    lines = [f"| row | {' | '.join(names)} | mean over rooms |", "|" + "---|" * (len(names) + 2)]
+    for key, title in {"": "the teacher", **{key: row.title for key, row in ROWS.items()}}.items():
+        scores: list[float | None] = []
+        for report in reports:
+            results = [result["miou"] for result in report["rows"] if result["request"]["row"] == key]
+            results += [report["teacher"]["miou"]] if key == "" and report["teacher"] else []
+            scores.append(100 * mean(results) if results else None)
+        known = [score for score in scores if score is not None]
+        whole = f"{mean(known):.1f} ({min(known):.1f} to {max(known):.1f})" if len(known) == len(scores) else "-"
+        if known:
+            cells = ["-" if score is None else f"{score:.1f}" for score in scores]
+            lines.append(f"| {title} | {' | '.join(cells)} | {whole} |")
+    return "\n".join(lines)
+
+
 def _range(values: list[float]) -> tuple[float, float]:
     return min(values), max(values)
 
@@ -188,3 +211,7 @@ def plot_quality_storage(
         shift, side = (-8, "right") if close else (8, "left")
         axes.annotate(name, (mib, 100 * miou), (shift, 0), textcoords="offset points", ha=side, va="center", fontsize=9)
     return figure
+
+
+if __name__ == "__main__":
+    print(rooms_text([Path(folder) for folder in sys.argv[1:]]))

@@ -8,6 +8,7 @@ from pathlib import Path
 import leaderboard
 import pytest
 import table1
+import table1_report
 import table1_rows
 import table2
 from small_room import ROOM
@@ -52,6 +53,8 @@ def test_a_run_writes_table_and_pictures_resumes_and_joins_the_leaderboard(tmp_p
     monkeypatch.setattr(table1.subprocess, "run", lambda *args, **kwargs: pytest.fail("made again"))
     run(monkeypatch, table1, *words)
     assert json.loads((out / "table1.json").read_text())["rows"] == report["rows"]
+    row_of_rooms = "| plain uplift | {0} | {0} | {0} ({0} to {0}) |".format(f"{100 * row['miou']:.1f}")
+    assert row_of_rooms in table1_report.rooms_text([out, out])
     runs, page = tmp_path / "runs", tmp_path / "page.md"
     run(monkeypatch, leaderboard, runs, page, "--add", out, "--name", "room-quick", "--about", "A tiny room.")
     kept = (runs / "room-quick.json").read_text()

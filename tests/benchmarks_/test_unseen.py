@@ -22,7 +22,6 @@ WORDS = LabelSet(
 def test_a_class_is_the_largest_of_its_words_and_a_word_belongs_to_the_class_that_names_it_first():
     assert unseen.ade_channels(["window blind"]) == [[64, 9, 19]]  # blind, window pane, curtain
     assert unseen.ade_channels(["window blind", "window", "magazine"]) == [[64, 19], [9], []]
-    assert min(map(len, unseen.ade_channels(list(unseen.ADE_WORDS)))) == 0 < len(unseen.ade_channels(["cup"])[0])
     logits = torch.tensor([[[9.0, 1.0, 5.0, -2.0], [9.0, -3.0, -4.0, -1.0]]])  # channel 0 is the background
     assert unseen.group_scores(logits, [[1, 2], [], [3]]).tolist() == [[[5, -2, -2], [-3, -3, -1]]]
 
@@ -64,7 +63,6 @@ def test_maps_are_scored_and_fused(room, tmp_path, monkeypatch, capsys):
     score = {file.stem: json.loads(file.read_text()) for file in (tmp_path / "out/scores").iterdir()}
     assert [name for name in classes if name not in score["loo-here"]["known"]] == ["chair"]
     assert score["loo-here"]["alone"]["iou"]["radio"] < 0.2 < score["loo-here"]["alone"]["known"]
-    assert score["own-here"]["known"] == score["own-here"]["classes"]
     assert score["ade-there"]["alone"]["accuracy"] > 95
     assert np.load(tmp_path / "out/loo/here" / f"{scene.stem(0)}.npy").shape == (8, 10, 32)
     rows = [line.split(" | ") for line in printed[2].splitlines()[2:]]
