@@ -46,7 +46,6 @@ def test_maps_are_scored_and_fused(room, tmp_path, monkeypatch, capsys):
         for i in scene.views("all"):
             labels = torch.tensor([*channels, 0])[load_label_map(room / "labels" / f"{scene.stem(i)}.png")]
             save_feature_map(tmp_path / "logits" / name, scene.stem(i), one_hot(labels, 150).float())
-        (tmp_path / "colors" / name).mkdir(parents=True)
         make_splat(room, tmp_path / "colors" / name / "color.ply")
     (tmp_path / "here/classes.json").write_text(json.dumps(classes).replace('"chair"', '"radio"'))
     WORDS.save(tmp_path / "words.safetensors")
