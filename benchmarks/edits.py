@@ -7,7 +7,7 @@ python benchmarks/edits.py uncovered CLASS SCENE LABELLED [SCENE LABELLED ...]  
 Prints which rule labels the colour cloud best (mIoU, and mIoU weighted by what each Gaussian shows), and, for the toy room,
 the removal and the recolouring of every class (`kfgs-removal/1`, `kfgs-recolor/1`). `uncovered` removes a class (or several:
 table,bottle), without and with `fill`, and compares with the scene without it (`kfgs-uncovered/1`): a toy room (DEMO/scene,
-DEMO/color.ply), or a room of benchmarks/rooms.py.
+DEMO/color.ply), or a room of benchmarks/rooms.py. It scores a recolouring of the first class, too.
 """
 
 from __future__ import annotations
@@ -145,6 +145,8 @@ def uncovered(name: str, pairs: list[tuple[Path, Path]]) -> None:
                 f"{folder} | {rule} | {row[0]:.2f} | {row[1]:.3f} | {row[2]:.4f} | {row[3]:+,} | {row[4]:.1f}",
                 flush=True,
             )
+        first = name.split(",")[0]
+        print(f"{folder} | {score_recolor(before, Recolor(first, BLUE).apply(before), folder, first, BLUE)}", flush=True)
     if len(pairs) > 1:
         for rule, table in rows.items():
             mean, spread = np.mean(table, axis=0), np.std(table, axis=0, ddof=1)
