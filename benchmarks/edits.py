@@ -146,7 +146,9 @@ def uncovered(name: str, pairs: list[tuple[Path, Path]]) -> None:
                 flush=True,
             )
         first = name.split(",")[0]
-        print(f"{folder} | {score_recolor(before, Recolor(first, BLUE).apply(before), folder, first, BLUE)}", flush=True)
+        print(
+            f"{folder} | {score_recolor(before, Recolor(first, BLUE).apply(before), folder, first, BLUE)}", flush=True
+        )
     if len(pairs) > 1:
         for rule, table in rows.items():
             mean, spread = np.mean(table, axis=0), np.std(table, axis=0, ddof=1)
