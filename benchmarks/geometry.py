@@ -2,7 +2,7 @@
 
     python benchmarks/geometry.py SCENE CLOUD...        # a CLOUD is a splat or a field.kfgs in the frame of the scene
 
-SCENE has depth/<stem>.npy, float32 [H, W] z-depth and 0 where nothing is known, as `kfgs toy` and benchmarks/rooms.py write it.
+SCENE has depth/<stem>.npy, float32 [H, W] z-depth, 0 where nothing is known (`make_toy_room`, benchmarks/rooms.py).
 Of all pixels of the test views where a surface is known: the median of |depth - true depth|, the share of pixels within 5 % of
 the true depth, and the share that shows nothing. The depth of a rendering is the median one (`Rendering.depth`).
 """
@@ -40,7 +40,7 @@ def main() -> None:
     parser.add_argument("scene", type=Path)
     parser.add_argument("clouds", type=Path, nargs="+", metavar="CLOUD")
     args = parser.parse_args()
-    scene = load_scene(args.scene)
+    scene = load_scene(args.scene)  # these scenes have no distortion
     stems = {i: args.scene / "depth" / f"{scene.stem(i)}.npy" for i in scene.views("test")}
     views = [(scene.cameras[i], torch.from_numpy(np.load(file))) for i, file in stems.items()]
     print("| cloud | Gaussians | median error | within 5 % | shows nothing |\n|---|---|---|---|---|")

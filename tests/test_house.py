@@ -12,8 +12,8 @@ from kfgs.cli import COMMANDS
 
 ROOT = Path(kfgs.__file__).parent
 AIM = {  # lines of Python with docstrings (DESIGN, section 2); "base": the files of kfgs/ itself
-    "cli": 1_800, "batch": 699, "pipeline": 1_900, "evaluation": 2_000, "viewer": 1_999, "viz": 2_100, "teachers": 1_892,
-    "fields": 2_300, "toy": 1_000, "labels": 1_900, "scenes": 3_200, "formats": 2_598, "splat": 998,
+    "cli": 1_800, "batch": 700, "pipeline": 1_900, "evaluation": 2_000, "viewer": 2_000, "viz": 2_100, "teachers": 1_900,
+    "fields": 2_300, "toy": 1_000, "labels": 1_900, "scenes": 3_200, "formats": 2_600, "splat": 1_000,
     "splat/engines": 5_300, "quant": 1_100, "cameras": 950, "base": 1_200,
 }  # fmt: skip
 NOT_YET = {  # what is above its aim: a change may lower these numbers, and never raises them

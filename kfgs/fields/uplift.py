@@ -1,8 +1,8 @@
 """Carry features of 2-D maps, or what views show of a trained field, to Gaussians: average in 3-D, correct, then compress.
 
-Each Gaussian takes the mean of the pixels that show it, weighted by its rendering weight w = T alpha. Every rendered pixel
-is a blend of Gaussians, so near a border the mean contains some of the neighbours. A few passes of the simultaneous iterative
-reconstruction technique (SIRT, Gilbert 1972) remove that: render, compare with the maps, carry the difference back.
+Each Gaussian takes the mean of the pixels that show it, weighted by its rendering weight w = T alpha, less at the picture's
+border. Every rendered pixel is a blend, so near the edge of a thing the mean contains some of the neighbours. A few passes of the
+simultaneous iterative reconstruction technique (SIRT, Gilbert 1972) remove that: render, compare, carry the difference back.
 
 *Sums* are [2, N, d + 1]: over the even and over the odd views, of d channels and, last, of the weight.
 
@@ -39,15 +39,15 @@ from .merge import merge_gaussians
 from .semantic_field import SemanticField
 from .working_maps import WorkingMaps, sample_latents, shrink_map
 
-LEFT_OUT = 8  # at most so many views judge a field
+LEFT_OUT = 8  # at most this many views judge a field
 SPARSE = 0.3  # share of the views' pixels: a splat of the scene fills nearly all of them
 NEIGHBOURS = 17  # a Gaussian and its 16 nearest, whose corrections are judged together
 KEEP, MOST = 0.999, 64  # share of the codewords' variation to keep, with at most this many latents
 PIXELS = 80_000  # most pixels of a view that are rendered
-BORDER, LEAST = (
-    0.25,
-    0.05,
-)  # in so wide a margin pixels count less, down to the least: networks err where things are cut off
+BORDER = (
+    0.25  # of the picture's size: nearer to its border pixels count less, for networks err where things are cut off
+)
+LEAST = 0.05  # what a pixel at the border counts
 
 
 @dataclass(frozen=True)
@@ -108,8 +108,9 @@ def uplift_maps(
         progress: show a bar.
 
     Returns:
-        A field with a `Linear` decoder. Latents are all-zero where no view shows the Gaussian. `info["explained"]` is what
-        `explained_shares` finds, and `info["note"]` warns if the Gaussians fill little of the views.
+        A field with a `Linear` decoder. Latents are all-zero where no view shows the Gaussian. `info["explained"]` has
+        two shares of the maps' variation: what fields of half of the views explain in views of the other half, and in their
+        own. `info["note"]` warns if the Gaussians fill little of the views.
 
     Raises:
         ValueError: if counts or shapes disagree, `write_splats` would refuse the Gaussians, a map is not finite, no map has
@@ -163,7 +164,7 @@ def sum_views(cloud: Gaussians, views: WorkingMaps, bar: Any) -> tuple[Tensor, T
         view, half = views[i], sums[i % 2]
         index, total, filled = sum_pixels(cloud, view.camera, _known(view.map, view.camera.size))
         half.index_add_(0, index, total)
-        shown.index_add_(0, index, view.scale * filled)
+        shown.index_add_(0, index, view.scale * filled * (total[:, -1] > 0))  # not where nothing is known
         bar.update()
     return sums, shown
 
@@ -195,19 +196,16 @@ def correct(cloud: Gaussians, sums: Tensor, views: WorkingMaps, bar: Any) -> Ten
 
 
 def explained_shares(cloud: Gaussians, sums: Tensor, views: WorkingMaps) -> list[float]:
-    """Shares in [0, 1] of the variation of eight views' maps that is explained by the other half of the views, and by their own.
-
-    If only the first is small, depths are wrong or views few; if both are, the teacher contradicts itself from view to view.
-    """
-    halves, lost, whole = per_weight(sums), [0.0, 0.0], EPS
+    """Shares of some views' variation, as far as latents keep it, that the other half of the views explains, and their own."""
+    halves, lost, whole = per_weight(sums), torch.zeros(2, dtype=torch.float64), EPS
     for i in range(0, len(views), -(-len(views) // LEFT_OUT) | 1):  # an odd step: of both halves
         view = views[i]
-        known = ~view.map[..., 0].isnan()
-        whole += float((view.map[known] - view.map[known].mean(0)).square().sum())
-        for k in range(2):
-            shown = rasterize(cloud.replace(features=halves[(i + 1 + k) % 2]), view.camera).map
-            lost[k] += float((shrink_map(shown, view.factor) - view.map)[known].square().sum())
-    return [max(0.0, 1 - part / whole) for part in lost]
+        rendering = rasterize(cloud.replace(features=torch.cat([halves[1 - i % 2], halves[i % 2]], 1)), view.camera)
+        known, covered = ~view.map[..., 0].isnan(), shrink_map(rendering.alpha[..., None], view.factor)
+        shown, said = shrink_map(rendering.map, view.factor)[known], (covered * view.map)[known]
+        whole += float((said - covered[known] * view.map[known].mean(0)).square().sum())
+        lost += (shown.unflatten(1, (2, -1)) - said[:, None]).square().sum(dim=(0, 2)).double().cpu()
+    return (1 - lost / whole).clamp(min=0).tolist()  # type: ignore[no-any-return]
 
 
 def reliability(first: Tensor, second: Tensor, near: Tensor) -> Tensor:  # [N, d] x 2, [N, k] -> [N] in [0, 1]
@@ -276,5 +274,5 @@ def join_fields(fields: Sequence[SemanticField]) -> SemanticField:
         first,
         gaussians=Gaussians.cat([part.gaussians.with_origin(first.gaussians.origin) for part in fields]),
         cameras=tuple(cameras.values()),
-        info=first.info | {"views": views},
+        info={name: value for name, value in first.info.items() if name != "explained"} | {"views": views},
     )

@@ -144,25 +144,26 @@ def _uplift(
     latents = None if method.latents is None else digest_tensors(method.latents.basis)
     seen = {"features": describe_maps(run, maps), "cameras": digest_cameras(cameras), "latents": latents}
     geometry, origin = _geometry(run, scene, views, method)
-    inputs = seen | {"geometry": digest_shape(geometry), "config": asdict(options), "seed": run.seed}
+    inputs = seen | {"geometry": digest_shape(geometry), "config": asdict(options), "seed": run.seed, "version": 2}
     scratch = run.scratch("uplift", seen | {"pixels": options.pixels})
 
     def make(folder: Path) -> None:
         given, generator = (geometry.to("cpu"), cameras, maps, options), run.generator("uplift")
         bar = run.progress is True
         field = uplift_maps(*given, latents=method.latents, generator=generator, scratch=scratch, progress=bar)
-        left_out, own = field.info["explained"]
-        run.say(
-            f"{field.dim} channels as {field.decoder.latent} latents; {len(field)} of {len(geometry)} Gaussians left; they "
-            f"explain {left_out:.0%} of the teacher's variation in views that are left out, {own:.0%} in their own"
-        )
-        if "note" in field.info:
-            run.say(f"note: {field.info['note']}")
         field.save(folder / NAME)
 
     stage = run.stage("uplift", inputs, make)
     shutil.rmtree(scratch, ignore_errors=True)
-    return SemanticField.load(stage.folder), {"method": "uplift", **origin}
+    field = SemanticField.load(stage.folder)
+    left_out, own = field.info["explained"]
+    run.say(
+        f"{field.dim} channels as {field.decoder.latent} latents; {len(field)} of {len(geometry)} Gaussians left; half of the "
+        f"views explains {left_out:.0%} of the teacher's variation in the other half, {own:.0%} in its own"
+    )
+    if "note" in field.info:
+        run.say(f"note: {field.info['note']}")
+    return field, {"method": "uplift", **origin, **field.info}
 
 
 def _geometry(run: Run, scene: Scene, views: list[int], method: Uplift) -> tuple[Gaussians, dict[str, Any]]:

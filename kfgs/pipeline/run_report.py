@@ -92,8 +92,8 @@ def write_run_report(
         "kfgs, torch": f"{info['kfgs']}, {torch.__version__}",
     }
     if shares := info.get("explained"):
-        said = "{:.0%} in views that are left out, {:.0%} in the field's own".format(*shares)
-        facts["explained of the teacher's variation"] = said
+        said = "{:.0%} in the other half, {:.0%} in its own".format(*shares)
+        facts["of the teacher's variation half of the views explains"] = said
     seconds = info["seconds"] | {"all stages": sum(info["seconds"].values())}
     facts |= {name: f"{value:,.0f} s" for name, value in seconds.items()}
     title = html.escape(folder.absolute().name)
