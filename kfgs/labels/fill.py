@@ -2,7 +2,7 @@
 
 Opacities behind a thing were never needed, so they were never learnt: black holes and tufts remain. Planes are found in what
 stays near it, and drawn from far above. Where a plane is thin, the more so the nearer the thing was, discs with the colours
-of the surface around replace its Gaussians. What is no plane stays as it is, and so do shadows of the thing.
+of the surface around replace its Gaussians. Whatever is not flat stays as it is, and so do shadows of the thing.
 """
 
 from __future__ import annotations
@@ -31,9 +31,10 @@ from .components import number_parts
 from .transfer import positions
 
 NEAR = 0.5  # planes are looked for within half the size of the thing
-PLANES, SHARE = 8, 0.02  # at most so many, each with 2 % of what is near, by area and opacity
+PLANES, SHARE = 8, 0.02  # at most 8 planes, each with 2 % of what is near, by area and opacity
 GUESSES, DRAWN, NEIGHBOURS = 500, 2_000, 16  # a guess is the plane through a point and two of its neighbours
 SEEN, SURE = 0.5, 0.8  # opacity of a surface's pixels, and of those whose colours are taken
+FLAT = 0.3  # a class lies on a surface if its share there is at least this much of the largest; feet only touch it
 EDGE = 4  # pixels at the edge of a surface, where it is mixed with others
 DENSE = 0.5  # a surface covers half of its convex hull
 CELLS = 400  # pixels of a plane's picture, at most
@@ -50,8 +51,11 @@ def fill_holes(gaussians: Gaussians, mask: Tensor) -> Gaussians:  # mask: [N] bo
     """
     if gaussians.sh is None:
         raise ValueError("fill: expected colours (sh) to continue, got none; edit the colour splat, or leave out fill")
-    cloud, mask = gaussians.detach().to("cpu", torch.float32).replace(origin=ORIGIN), mask.cpu()
-    kept, part = cloud.select(~mask), number_parts(cloud, mask)[mask].numpy()
+    cloud, mask, like = gaussians.detach().to("cpu").replace(origin=ORIGIN), mask.cpu(), gaussians.means
+    zero = cloud.means[mask].double().nanmedian(0).values  # float32 counts from the thing
+    cloud = cloud.replace(means=cloud.means.double() - zero).to(torch.float32)
+    apart = 4 * float(cloud.scales.amax(1).nanmedian())  # scattered Gaussians are no thing: their size is 0
+    kept, part = cloud.select(~mask), number_parts(cloud, mask, apart)[mask].numpy()
     points, thing = positions("gaussians.means", kept.means), positions("gaussians.means", cloud.means[mask])
     names, which = np.unique(part, return_inverse=True)
     sizes = np.array([np.ptp(np.quantile(thing[part == i], (0.05, 0.95), axis=0), axis=0).max() for i in names])
@@ -59,23 +63,25 @@ def fill_holes(gaussians: Gaussians, mask: Tensor) -> Gaussians:  # mask: [N] bo
     near = np.isfinite(tree.query(points, distance_upper_bound=NEAR * size)[0])
     new, hidden = [], np.zeros(len(points), bool)
     if near.any():
-        cell = float(np.median(kept.scales.amax(1).numpy()[near]))
-        weights = (kept.opacities * kept.scales.topk(2).values.prod(1)).double().numpy()[near]
+        cell = float(np.nanmedian(kept.scales.amax(1).numpy()[near]))
+        weights = np.nan_to_num((kept.opacities * kept.scales.topk(2).values.prod(1)).double().numpy()[near], posinf=0)
         weights = np.minimum(weights, np.quantile(weights, 0.95))  # a single large one is no plane
         for normal, place in _planes(points[near], weights, 2 * cell):
             discs, rows = _continue(kept, points, tree, normal, place, cell, size)
             hidden[rows] = True
             new.append(discs)
-    tell(f"fill: {sum(map(len, new)):,} new Gaussians continue the surfaces around what is removed; nobody saw them")
-    filled = Gaussians.cat([kept.select(torch.from_numpy(~hidden)), *new]).replace(origin=gaussians.origin)
-    return filled.to(gaussians.means.device, gaussians.means.dtype)
+    count = f"{sum(map(len, new)):,} new Gaussians, in place of {hidden.sum():,},"
+    tell(f"fill: {count} continue the surfaces around what is removed; nobody saw them")
+    new = [discs.replace(means=discs.means.double() + zero, origin=gaussians.origin) for discs in new]
+    rest = gaussians.select(np.flatnonzero(~mask.numpy())[~hidden])  # as they were, to the last bit
+    return Gaussians.cat([rest, *(discs.to(like.device, like.dtype) for discs in new)])
 
 
 def _planes(points: Array, weights: Array, reach: float) -> Iterator[tuple[Array, Array]]:  # [3], [3]
     """Planes (normal and point), the heaviest first: RANSAC within `reach` (scikit-image's has no planes), then least squares."""
     rng, least = np.random.default_rng(0), SHARE * weights.sum()
     for _ in range(PLANES):
-        drawn = points[rng.choice(len(points), DRAWN, p=weights / weights.sum())] if len(points) else points
+        drawn = points[rng.choice(len(points), DRAWN, p=weights / weights.sum())] if weights.sum() > 0 else points[:0]
         if len(places := np.unique(drawn, axis=0)) <= NEIGHBOURS:
             return
         a = places[rng.integers(len(places), size=GUESSES)]
@@ -106,7 +112,8 @@ def _continue(
     middle -= (middle - place) @ normal * normal
     side, far, fov = min(math.ceil(extent / cell) + 1, CELLS), FAR * extent, 2 * math.degrees(math.atan(0.5 / FAR))
     cell, eye, up = extent / side, torch.from_numpy(middle + far * normal), np.eye(3)[np.abs(normal).argmin()].tolist()
-    camera = Camera.look_at(eye, torch.from_numpy(middle), up=up, fov_degrees=fov, width=side, height=side)
+    lens = {"fov_degrees": fov, "width": side, "height": side, "near": far / 2}
+    camera = Camera.look_at(eye, torch.from_numpy(middle), up=up, **lens)  # type: ignore[arg-type]
     local, rough = world_to_camera(camera, torch.from_numpy(points)), camera.to(torch.float32)
     above, (column, row) = far - local[:, 2].numpy(), camera_to_pixel(camera, local).floor().long().numpy().T
     inside = (column >= 0) & (column < side) & (row >= 0) & (row < side)
@@ -127,7 +134,12 @@ def _continue(
     known = np.dstack([color / np.maximum(alpha, 1e-6)[..., None], np.ones_like(alpha)]) * sure[..., None]
     blurred = np.sum([gaussian_filter(known, (scale, scale, 0))[thin] / scale**2 for scale in SCALES], axis=0)
     color, means = (blurred[:, :3] / np.maximum(blurred[:, 3:], 1e-12)).clip(0, 1), centres[thin]
-    discs = surface.select(torch.from_numpy(cKDTree(points[layer]).query(means)[1]))
+    if kept.labels is not None:  # what stands on a surface, and touches it, gives nothing and stays
+        by_class = kept.labels.numpy() + 1
+        total, flat = np.bincount(by_class[inside & (np.abs(above) < size)]), np.bincount(by_class[layer])
+        share = flat / np.maximum(total[: len(flat)], 1)
+        layer = layer[(share >= FLAT * share.max(initial=0))[by_class[layer]]]
+    discs = kept.select(torch.from_numpy(layer[cKDTree(points[layer]).query(means)[1]]))
     quat = Rotation.from_matrix(camera.R.numpy().T).as_quat(scalar_first=True)
     rows = {"means": means, "quats": [quat], "scales": [(cell, cell, 0.1 * cell)]}
     shape = {name: torch.tensor(np.array(values)).float().expand(len(means), -1) for name, values in rows.items()}

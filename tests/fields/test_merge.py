@@ -175,16 +175,3 @@ def test_a_fragment_joins_the_heaviest_kind_of_its_cube(light, groups):
     expected = (3 * torch.tensor([1.0, 0]) + light * torch.tensor([0.0, 1])) / (3 + light)
     if groups == 1:
         torch.testing.assert_close(merged.gaussians.features[0], expected)
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_the_order_of_gaussians_does_not_matter(one_kind, seed):
-    """With one kind of feature; the first centres of k-means are drawn by position."""
-    cloud, weights = random_cloud(seed=seed)
-    order = torch.randperm(len(cloud), generator=torch.Generator().manual_seed(seed))
-    one = merge_gaussians(cloud, weights, 60)
-    other = merge_gaussians(cloud.select(order), weights[order], 60)
-    assert torch.equal(other.group, one.group[order])
-    for name in ("means", "opacities", "features"):
-        torch.testing.assert_close(getattr(other.gaussians, name), getattr(one.gaussians, name))
-    torch.testing.assert_close(covariances(other.gaussians), covariances(one.gaussians), atol=1e-6, rtol=1e-4)

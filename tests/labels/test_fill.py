@@ -10,6 +10,7 @@ from kfgs.cameras import Camera
 from kfgs.gaussians import Gaussians
 from kfgs.labels import EditList, Extract, Remove
 from kfgs.labels.edit_list import read_edits
+from kfgs.labels.selection import OfIndex
 from kfgs.splat import rasterize
 from kfgs.splat.sh import rgb_to_sh0
 
@@ -23,7 +24,7 @@ def patch(low, high, label, color, step=0.05):
     means = torch.cartesian_prod(*(torch.arange(a, b + 1e-6, step) for a, b in zip(low, high, strict=True)))
     sh = torch.zeros(len(means), 4, 3)
     sh[:, 0] = rgb_to_sh0(torch.tensor(color))
-    made = balls(means, torch.full((len(means),), label), names=("floor", "box"), sh=sh)
+    made = balls(means, torch.full((len(means),), label), names=("floor", "box", "crate"), sh=sh)
     return made.replace(scales=torch.full_like(means, 0.6 * step), opacities=torch.full((len(means),), 0.9))
 
 
@@ -51,12 +52,21 @@ def test_the_floor_continues_under_the_box():
     assert float((closed.map - before.map).abs()[far].max()) < 8 / 255
 
 
-def test_a_gap_with_something_behind_is_no_hole():
-    """A box between two shelves: one sees through to the floor, and the shelves do not grow together."""
-    shelves = [patch((x, -0.5, 0.6), (x + 0.4, 0.5, 0.6), 0, BLUE) for x in (-0.6, 0.2)]
-    floor, box = patch((-1.5, -1.5, 0), (1.5, 1.5, 0), 0, RED), patch((-0.1, -0.2, 0.4), (0.1, 0.2, 0.8), 1, GREEN)
-    after = EDIT.apply(Gaussians.cat([floor, *shelves, box]))
-    assert not bool(((after.means[:, 0].abs() < 0.15) & (after.means[:, 2] > 0.3)).any())
+def test_a_hole_that_shows_a_floor_stays():
+    shelf = patch((-1, -1, 0.6), (1, 1, 0.6), 0, BLUE)
+    shelf, box = shelf.select(shelf.means[:, :2].abs().amax(1) > 0.3), patch((-0.2, -0.2, 0.6), (0.2, 0.2, 1), 1, GREEN)
+    after = EDIT.apply(Gaussians.cat([patch((-1.5, -1.5, 0), (1.5, 1.5, 0), 0, RED), shelf, box]))
+    assert not bool(((after.means[:, :2].abs().amax(1) < 0.25) & (after.means[:, 2] > 0.3)).any())
+
+
+def test_what_stands_beside_or_above_stays():
+    """A crate that touches the box keeps its Gaussians, a ceiling hides no floor, and scattered Gaussians are no thing."""
+    crate, ceiling = patch((0.25, -0.2, 0), (0.45, 0.2, 0.3), 2, BLUE), patch((-1, -1, 1.2), (1, 1, 1.2), 0, GREEN)
+    before = Gaussians.cat([room(), crate, ceiling])
+    after = EDIT.apply(before)
+    assert int((after.labels == 2).sum()) == len(crate)
+    assert int(((after.means[:, :2].abs().amax(1) < 0.2) & (after.means[:, 2].abs() < 0.01)).sum()) > 60
+    assert len(Remove(OfIndex(range(0, 1300, 97)), fill=True).apply(before)) == len(before) - 14
 
 
 def test_without_a_surface_nothing_is_invented():
