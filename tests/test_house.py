@@ -17,7 +17,7 @@ AIM = {  # lines of Python with docstrings (DESIGN, section 2); "base": the file
     "splat/engines": 5_300, "quant": 1_100, "cameras": 950, "base": 1_200,
 }  # fmt: skip
 NOT_YET = {  # what is above its aim: a change may lower these numbers, and never raises them
-    "fields": 2_657, "labels": 2_024,
+    "fields": 2_653, "labels": 2_024,
     "quant": 1_261, "base": 1_250,
 }  # fmt: skip
 SCRIPTS = 4_000  # lines of the viewer's JavaScript

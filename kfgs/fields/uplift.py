@@ -44,9 +44,7 @@ SPARSE = 0.3  # share of the views' pixels: a splat of the scene fills nearly al
 NEIGHBOURS = 17  # a Gaussian and its 16 nearest, whose corrections are judged together
 KEEP, MOST = 0.999, 64  # share of the codewords' variation to keep, with at most this many latents
 PIXELS = 80_000  # most pixels of a view that are rendered
-BORDER = (
-    0.25  # of the picture's size: nearer to its border pixels count less, for networks err where things are cut off
-)
+BORDER = 0.25  # of a picture's size: nearer to its border pixels count less; networks err where things are cut off
 LEAST = 0.05  # what a pixel at the border counts
 
 
