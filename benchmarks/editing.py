@@ -169,7 +169,7 @@ def score_removal(
     """
     truth = ClassTruth(as_path(scene), name, split)
     surface = find_points(truth.folder)
-    points, of_class = surface.points, surface.labels == truth.label
+    points, of_class = surface.points, torch.isin(surface.labels, truth.labels)
     owned = [_is_nearest(cloud, points, of_class) for cloud in (before, after)]
     gone, changed, shown, untouched, off_border = (_Share() for _ in range(5))
     for camera, inside, far in truth.views():
@@ -317,7 +317,7 @@ class ClassTruth:
         names, parts = read_json(folder / "classes.json"), name.split(",")
         if not set(parts) <= set(names):
             raise ValueError(f"name: expected one of {', '.join(names)} (classes of {folder}), got {name!r}")
-        self.folder, self.label, self.labels = folder, names.index(parts[0]), [names.index(part) for part in parts]
+        self.folder, self.labels = folder, torch.tensor([names.index(part) for part in parts])
         self.scene: Scene = load_scene(folder)
         self.indices = tuple(self.scene.views(split))
         if not any(bool(self._inside(i).any()) for i in self.indices):
@@ -327,7 +327,7 @@ class ClassTruth:
             )
 
     def _inside(self, i: int) -> Tensor:  # [H, W] bool
-        return torch.isin(self._labels(i), torch.tensor(self.labels))
+        return torch.isin(self._labels(i), self.labels)
 
     def _labels(self, i: int) -> Tensor:  # [H, W] int64
         path, camera = self.folder / "labels" / f"{self.scene.stem(i)}.png", self.scene.cameras[i]

@@ -273,18 +273,15 @@ def main() -> None:
     parser.add_argument("--logits", type=Path, help="maps: a folder of logits per room, for ade")
     parser.add_argument("--colors", type=Path, help="table: a folder with <room>/color.ply")
     args = parser.parse_args()
-    heads = {"weights": "loo" in args.teachers or "own" in args.teachers}
-    needed = (
-        {"colors": True}
-        if args.command == "table"
-        else heads | {"words": heads["weights"], "logits": "ade" in args.teachers}
-    )
-    if missing := [f"--{name}" for name, needs in needed.items() if needs and getattr(args, name) is None]:
+    heads = set(args.teachers) - {"ade"}
+    needed = ["weights", "words"] * bool(heads) + ["logits"] * ("ade" in args.teachers)
+    needed = ["colors"] if args.command == "table" else needed
+    if missing := [f"--{name}" for name in needed if getattr(args, name) is None]:
         parser.error(f"{args.command}: expected {', '.join(missing)}, got none; --help says what it is")
     rooms = [Room(folder) for folder in args.rooms]
     if len({room.name for room in rooms}) < len(rooms):
         parser.error("ROOM: expected folders of different names, got repeats; rename one")
-    if args.command == "maps" and set(args.teachers) - {"ade"}:
+    if args.command == "maps" and heads:
         backbone = load_teacher("dinov2", args.weights, size=SIZE)
         for room in rooms:
             extract_features(backbone, room.scene, args.out / "tokens" / room.name, "all")

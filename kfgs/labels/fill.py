@@ -57,9 +57,9 @@ def fill_holes(gaussians: Gaussians, mask: Tensor) -> Gaussians:  # mask: [N] bo
     apart = 4 * float(cloud.scales.amax(1).nanmedian())  # scattered Gaussians are no thing: their size is 0
     kept, part = cloud.select(~mask), number_parts(cloud, mask, apart)[mask].numpy()
     points, thing = positions("gaussians.means", kept.means), positions("gaussians.means", cloud.means[mask])
-    names, which = np.unique(part, return_inverse=True)
-    sizes = np.array([np.ptp(np.quantile(thing[part == i], (0.05, 0.95), axis=0), axis=0).max() for i in names])
-    size, tree = float(np.median(sizes[which])), cKDTree(thing)  # most parts may be specks: the median over Gaussians
+    edges = [np.quantile(thing[part == i], (0.05, 0.95), axis=0) for i in range(part.max() + 1)]
+    size = float(np.median(np.ptp(edges, axis=1).max(1)[part]))  # most parts may be specks: the median over Gaussians
+    tree = cKDTree(thing)
     near = np.isfinite(tree.query(points, distance_upper_bound=NEAR * size)[0])
     new, hidden = [], np.zeros(len(points), bool)
     if near.any():
