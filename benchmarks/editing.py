@@ -50,6 +50,10 @@ UNCOVERED = (
     "without it: one PSNR over all these pixels and channels, and the mean of SSIM (kornia, Gaussian window 11x11 with sigma "
     "1.5) at them. Untouched = share of the pixels of other classes of which the edit moved no channel by 8/255"
 )
+MOVED = (
+    "kfgs-moved/1: the same for a class that was moved: the pixels that show it before or after, against the scene with the "
+    "class there"
+)
 STEP = 8 / 255  # a channel that moves less is untouched: twice what 8-bit rounding and a JPEG would do
 HUE = 20.0  # degrees
 LEAST_LIGHT = 0.25  # share of a pixel's light that the object gave before the edit; of other pixels nothing can be said
@@ -263,23 +267,24 @@ class UncoveredReport:
 
     def __str__(self) -> str:
         return (
-            f"{self.name} removed: {self.psnr:.2f} dB, SSIM {self.ssim:.3f} where it was ({self.pixels:,} pixels of "
+            f"{self.name}: {self.psnr:.2f} dB, SSIM {self.ssim:.3f} where it was ({self.pixels:,} pixels of "
             f"{self.views} views); untouched elsewhere: {self.untouched_pixels:.4f} ({self.protocol.split(':')[0]})"
         )
 
 
 def score_uncovered(
-    before: Gaussians, after: Gaussians, scene: str | Path, name: str, *, split: str = "test"
+    before: Gaussians, after: Gaussians, scene: str | Path, name: str, *, split: str = "test", moved: bool = False
 ) -> UncoveredReport:
-    """Score what the removal of a class uncovers (protocol `kfgs-uncovered/1`, see `UNCOVERED`).
+    """Score what the removal of a class uncovers, or its move (protocols `kfgs-uncovered/1`, `kfgs-moved/1`).
 
     Args:
         before: the colour field.
-        after: the same field without the class.
+        after: the same field without the class, or with the class moved.
         scene: a folder that `make_toy_room` wrote (the room is rendered again, without the class), or `benchmarks/rooms.py`
-            whose `without/` lacks what is named.
+            whose `without/` lacks what is named, and whose `moved/` has it elsewhere.
         name: the class, or several between commas.
         split: which views are looked at.
+        moved: whether it was moved, as `moved` of the room's JSON says.
 
     Raises:
         FileNotFoundError: if the scene has neither `toy.json` nor `without/`.
@@ -289,24 +294,28 @@ def score_uncovered(
     squares, similar, count, untouched = 0.0, 0.0, 0, _Share()
     for i, (camera, inside, _) in zip(truth.indices, truth.views(), strict=True):
         old, new = (_picture(cloud, camera) for cloud in (before, after))
-        wanted = _without(truth.folder, truth.scene.stem(i), camera, name)
+        if moved:
+            labels = load_label_map(truth.folder / "moved/labels" / f"{truth.scene.stem(i)}.png")
+            inside = inside | torch.isin(labels, truth.labels)
+        wanted = _edited(truth.folder, truth.scene.stem(i), camera, name, moved)
         pair = (picture.permute(2, 0, 1)[None] for picture in (new, wanted))
         squares += float((new - wanted).double().square()[inside].sum())
         similar += float(kornia.metrics.ssim(*pair, 11)[0].mean(dim=0)[inside].double().sum())
         count += int(inside.sum())
         untouched.add((new - old).abs().amax(-1) < STEP, among=~inside)
     ssim = similar / count if count else math.nan
-    return UncoveredReport(name, _psnr([(squares, 3 * count)]), ssim, untouched.value, count, len(truth.indices))
+    score = _psnr([(squares, 3 * count)]), ssim, untouched.value, count, len(truth.indices)
+    return UncoveredReport(name, *score, MOVED if moved else UNCOVERED)
 
 
-def _without(folder: Path, stem: str, camera: Camera, name: str) -> Tensor:  # [H, W, 3] in [0, 1]
-    """The true picture of a view without a class."""
-    if (folder / "toy.json").is_file():
+def _edited(folder: Path, stem: str, camera: Camera, name: str, moved: bool) -> Tensor:  # [H, W, 3] in [0, 1]
+    """The true picture of a view without a class, or with the class moved."""
+    if (folder / "toy.json").is_file() and not moved:
         seed = read_json(folder / "toy.json")["config"]["seed"]
         solids = [solid for solid in build_room(seed) if solid.label not in name.split(",")]
         picture = render(solids, Noise(np.random.default_rng([seed, 3])), camera)[0]
     else:
-        picture = np.array(Image.open(folder / "without" / "images" / f"{stem}.png"))
+        picture = np.array(Image.open(folder / ("moved" if moved else "without") / "images" / f"{stem}.png"))
     return torch.from_numpy(picture).float() / 255
 
 

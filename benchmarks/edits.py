@@ -7,7 +7,8 @@ python benchmarks/edits.py uncovered CLASS SCENE LABELLED [SCENE LABELLED ...]  
 Prints which rule labels the colour cloud best (mIoU, and mIoU weighted by what each Gaussian shows), and, for the toy room,
 the removal and the recolouring of every class (`kfgs-removal/1`, `kfgs-recolor/1`). `uncovered` removes a class (or several:
 table,bottle), without and with `fill`, and compares with the scene without it (`kfgs-uncovered/1`): a toy room (DEMO/scene,
-DEMO/color.ply), or a room of benchmarks/rooms.py. It scores a recolouring of the first class, too.
+DEMO/color.ply), or a room of benchmarks/rooms.py. It scores a recolouring of the first class, too, and a move if the room
+has `moved/` (`kfgs-moved/1`).
 """
 
 from __future__ import annotations
@@ -24,11 +25,12 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from kfgs import SemanticField, attach, load_label_set, load_scene, read_splats
+from kfgs._files import read_json
 from kfgs.cameras import Camera
 from kfgs.cameras.resample import undistort_labels
 from kfgs.evaluation.label_pictures import load_label_map
 from kfgs.gaussians import Gaussians
-from kfgs.labels import EditList, LabelSet, Recolor, Remove, transfer_labels
+from kfgs.labels import EditList, LabelSet, Move, Recolor, Remove, transfer_labels
 from kfgs.scenes import Scene
 from kfgs.splat import average_views, vote_labels
 
@@ -135,10 +137,16 @@ def uncovered(name: str, pairs: list[tuple[Path, Path]]) -> None:
         rules = {"as it was": EditList()} | {
             f"fill={fill}": EditList((Remove(name.split(","), fill),)) for fill in (False, True)
         }
+        if (folder / "moved").is_dir():
+            by = read_json(Path(__file__).parent / "rooms" / f"{folder.resolve().name}.json")["moved"]
+            rules["moved"] = EditList((Move(name.split(","), translation=by),))
         for rule, edits in rules.items():
             started = time.perf_counter()
             after = edits.apply(before)
-            seconds, score = time.perf_counter() - started, score_uncovered(before, after, folder, name)
+            seconds, score = (
+                time.perf_counter() - started,
+                score_uncovered(before, after, folder, name, moved=rule == "moved"),
+            )
             row = [score.psnr, score.ssim, score.untouched_pixels, len(after) - len(before), seconds]
             rows.setdefault(rule, []).append(row)
             print(

@@ -13,6 +13,7 @@ OUT is a scene that `kfgs color`, `kfgs fit` and `kfgs evaluate` open. Metres, z
     instances/<stem>.png     index into instances.json; 255 = void
     depth/<stem>.npy         float32 [H, W] z-depth, 0 where nothing is hit
     without/                 the same four of each test view, with the things of --without removed from the room
+    moved/                   and with the same things moved, if the JSON says by how many metres
     transforms.json, points.ply, split.json: cameras, 30,000 points with 1 cm noise, training and test views
 A run that was killed continues: a view is made once, its picture last. transforms.json comes at the end.
 """
@@ -79,14 +80,22 @@ def class_of(instance: str) -> str:
     return instance.rsplit(" ", 1)[0]
 
 
-def mend(folder: Path, removed: Sequence[str] = ()) -> ET.Element:
-    """The scene file of Mitsuba 0.6 as 3.9 reads it, with an id for each shape: its mesh's name, or kind and number."""
+def mend(folder: Path, meshes: Sequence[str] = (), shift: Sequence[float] | None = None) -> ET.Element:
+    """The scene file of Mitsuba 0.6 as 3.9 reads it, with an id for each shape: its mesh's name, or kind and number.
+
+    Some meshes are moved by `shift`, in the scene's units and axes, or removed.
+    """
     root = ET.parse(folder / "scene.xml").getroot()
     for number, e in enumerate(root.findall("shape")):
         mesh = e.find("string[@name='filename']")
         e.set("id", f"{e.get('type')}{number}" if mesh is None else Path(mesh.get("value", "")).stem)
-        if e.get("id") in removed or (mesh is not None and not (folder / mesh.get("value", "")).exists()):
+        chosen = e.get("id") in meshes
+        if (chosen and shift is None) or (mesh is not None and not (folder / mesh.get("value", "")).exists()):
             root.remove(e)
+        elif chosen and shift is not None:
+            place = e.find("transform[@name='toWorld']")
+            place = ET.SubElement(e, "transform", name="toWorld") if place is None else place
+            ET.SubElement(place, "translate", dict(zip("xyz", map(str, shift), strict=True)))
     for e in list(root.iter()):
         value = e.get("value", "")
         if e.get("name") == "filename":
@@ -109,16 +118,19 @@ def mend(folder: Path, removed: Sequence[str] = ()) -> ET.Element:
 class Room:
     """A scene in Mitsuba, asked in metres with z up."""
 
-    def __init__(self, folder: Path, metres_per_unit: float, removed: Sequence[str] = ()) -> None:
+    def __init__(
+        self, folder: Path, metres_per_unit: float, meshes: Sequence[str] = (), moved: Sequence[float] | None = None
+    ) -> None:
         import drjit
         import mitsuba as mi
 
         self.mi, self.reinterpret = mi, drjit.reinterpret_array
-        text = ET.tostring(mend(folder, removed), encoding="unicode")
+        self.to_scene = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # z up to y up
+        shift = None if moved is None else (self.to_scene @ np.array(moved) / metres_per_unit).tolist()
+        text = ET.tostring(mend(folder, meshes, shift), encoding="unicode")
         self.scene, self.unit = mi.load_string(text, optimize=False), metres_per_unit  # optimize would join shapes
         self.shapes = [shape.id() for shape in self.scene.shapes()]
         self.tops = np.array([0.9 * s.bbox().max.y + 0.1 * s.bbox().min.y for s in self.scene.shapes()])
-        self.to_scene = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # z up to y up
         registered = np.array(self.reinterpret(mi.UInt32, self.scene.shapes_dr()))  # as threads loaded them
         self.place = np.full(int(registered.max()) + 1, -1)
         self.place[registered] = np.arange(len(registered))
@@ -251,10 +263,12 @@ def main() -> None:
         raise SystemExit(f"{args.out}: made with {plan['options']}, not {options}; choose another folder")
     views = {stem: np.array(pose) for stem, pose in plan["views"].items()}
     jobs = [(room, things, args.out, stem) for stem in views]
-    if removed:
-        less = Room(args.scene, about["metres_per_unit"], removed)
-        kept = Things(about["things"], less.shapes, removed)
-        jobs += [(less, kept, args.out / "without", stem) for stem in views if stem.startswith("test")]
+    test = [stem for stem in views if stem.startswith("test")]
+    edited = {"without": None} | ({"moved": about["moved"]} if "moved" in about else {})
+    for folder, shift in edited.items() if removed else ():
+        other = Room(args.scene, about["metres_per_unit"], removed, shift)
+        kept = Things(about["things"], other.shapes, removed)
+        jobs += [(other, kept, args.out / folder, stem) for stem in test]
     for number, (shown, ids, out, stem) in enumerate(jobs):
         if not (out / "images" / f"{stem}.png").exists():
             started, light = time.time(), {"spp": args.spp, "seed": number, "exposure": about["exposure"]}
