@@ -26,7 +26,11 @@ class PaperCodebook:
 
     Farthest-point sampling on the first image gives the first codewords. Then, image by image: quantise (Eq. 5), let badly
     represented features join (Eq. 8), gather the gradient of the class-balanced loss (Eq. 6-7), take an Adam step when one
-    is due, and drop codewords that became too similar (Eq. 9). Codewords that survive keep Adam's moments.
+    is due, and drop codewords that are too similar (Eq. 9). Codewords that stay keep Adam's moments, and their gradients
+    gathered since the last step.
+
+    The result depends on the unit of the features, because codewords keep their length while `learning_rate` does not:
+    features and rate times 10 give codewords times 10, features alone do not.
     """
 
     maximum: int = 100
@@ -38,12 +42,16 @@ class PaperCodebook:
     initial: int = 8
     """Codewords from farthest-point sampling on the first image (rho)."""
     joins_per_image: int | None = None
-    """The most features of one image that join in one visit, the least similar first. None shares the free slots among the
-    images, so that the first ones seen do not fill the codebook; the paper leaves its batches open."""
+    """None, as printed (Eq. 8): every feature of an image whose cosine with its codeword is below alpha joins at once, up to
+    K_max; if more qualify than there is room for, the least similar (the paper gives no order, this one is the script's).
+    A number: at most so many features of an image, each the one least similar to all codewords including those that joined
+    just before. With ceil((K_max - rho) / images), neither one image nor copies of one feature fill the codebook."""
     epochs: int = 28
     """Passes over all maps, in random order."""
     learning_rate: float = 8e-4
-    """Adam's, in units of the features. It fits features of a length of about 10, as LSeg's summed scales have."""
+    """Adam's, in units of the features: a step moves each channel of a codeword by about this much, whatever its length. The
+    paper's value is for its own features, LSeg's sum over four scales; features of length 10 turn ten times slower than
+    those of length 1."""
     eager_epochs: int = 2
     """Epochs at the start with a step after every image (script)."""
     step_every: int = 8
@@ -66,8 +74,7 @@ class PaperCodebook:
         first = next((features for features in map(read, range(maps)) if len(features)), None)
         if first is None:
             raise all_zero(maps)
-        joins = self.joins_per_image or max(1, -(-(self.maximum - self.initial) // maps))
-        book = EvolvingCodebook(first[farthest_points(first, self.initial)], self, joins)
+        book = EvolvingCodebook(first[farthest_points(first, self.initial)], self)
         history: list[dict[str, Any]] = []
         bar = tqdm(range(self.epochs), desc="codebook", disable=progress is not True)
         for epoch in bar:
@@ -79,7 +86,8 @@ class PaperCodebook:
                 if len(features):
                     visits.append(book.learn_from(features))
                 if seen % period == 0 or seen == maps:
-                    pruned += book.step()
+                    book.step()
+                pruned += book.prune()
             size, (losses, similarities) = len(book.rows), zip(*visits, strict=True)
             record: dict[str, Any] = {"epoch": epoch, "size": size, "added": size - before + pruned, "pruned": pruned}
             record |= {"loss": sum(losses) / len(losses)} | coverage(torch.cat(similarities), self.expand_below)
@@ -92,27 +100,33 @@ class PaperCodebook:
         return with_report(codebook.codewords, history, Nearest(*nearest), self.expand_below)
 
 
-def farthest_points(features: Tensor, count: int) -> Tensor:  # [n, D] -> [min(count, nonzero rows)] int64
+def farthest_points(features: Tensor, count: int) -> Tensor:  # [n, D], none all-zero -> [min(count, n)] int64
     """Pick the `count` most diverse features: farthest-point sampling with cosine similarity as the measure.
 
-    The first two are the least similar pair of all (the earlier one first), then `expand` continues: each further one is the
-    feature whose largest similarity to those already picked is smallest. Ties go to the lowest row; all-zero rows are never
-    picked. When nothing else is left, an equal feature may be picked; pruning (Eq. 9) takes it out again.
+    The first two are the least similar pair of all (the earlier one first), then `farthest_first` continues. Ties go to the
+    lowest row. When nothing else is left, an equal feature may be picked; pruning (Eq. 9) takes it out again.
     """
-    rows = (row_norms(features) > EPS).nonzero()[:, 0]
-    unit = unit_rows(features[rows])
-    if len(rows) < 2:
-        return rows
+    unit = unit_rows(features)
     least, pair = float("inf"), (0, 1)
     for start in range(0, len(unit) - 1, BLOCK):  # the upper triangle, one block of rows at a time
         similarity = unit[start : start + BLOCK] @ unit[start:].T  # [b, n - start], starts on the diagonal
         row, column = divmod(int(similarity.fill_diagonal_(torch.inf).argmin()), similarity.shape[1])
         if float(similarity[row, column]) < least:
             least, pair = float(similarity[row, column]), (start + min(row, column), start + max(row, column))
-    picked = torch.tensor(pair[:count], device=rows.device)
+    picked = torch.tensor(pair[: min(count, len(unit))], device=unit.device)
     largest = (unit @ unit[picked].T).amax(dim=1)
     largest[picked] = torch.inf  # never twice
-    return rows[torch.cat([picked, expand(unit, largest, threshold=torch.inf, room=count - len(picked))])]
+    return torch.cat([picked, farthest_first(unit, largest, torch.inf, count - len(picked))])
+
+
+def farthest_first(unit: Tensor, similarity: Tensor, below: float, count: int) -> Tensor:  # [n, D], [n] -> [m] int64
+    """The row of least similarity, then again after similarities are updated by it; at most `count`, each below the limit."""
+    best, chosen = similarity.clone(), list[int]()
+    while len(chosen) < min(count, len(best)) and float(best[least := int(best.argmin())]) < below:
+        chosen.append(least)
+        best = torch.maximum(best, unit @ unit[least])
+        best[least] = torch.inf  # present now, whatever rounding makes of its cosine with itself
+    return torch.tensor(chosen, dtype=torch.int64, device=unit.device)
 
 
 class EvolvingCodebook:
@@ -122,9 +136,8 @@ class EvolvingCodebook:
     would start with a jump of about three learning rates. For rows that are there from the start the two agree.
     """
 
-    def __init__(self, codewords: Tensor, options: PaperCodebook, joins: int) -> None:  # [K, D], the most per image
-        self.options, self.joins = options, joins
-        self.state = _fresh(codewords)
+    def __init__(self, codewords: Tensor, options: PaperCodebook) -> None:  # [K, D]
+        self.options, self.state = options, _fresh(codewords)
         self.gathered = 0  # gradients since the last step
 
     @property
@@ -136,8 +149,7 @@ class EvolvingCodebook:
         """Quantise, expand, and gather the gradient; the loss, and each feature's similarity to the codewords before [n]."""
         size = len(self.rows)
         index, similarity = Codebook(self.rows).nearest(features)
-        room = min(self.joins, self.options.maximum - size)
-        joining = features[expand(features, similarity, threshold=self.options.expand_below, room=room)]
+        joining = features[self.expand(features, similarity)]
         if len(joining):
             newest = Codebook(joining).nearest(features)
             index = torch.where(newest.similarity > similarity, newest.codeword + size, index)
@@ -147,20 +159,38 @@ class EvolvingCodebook:
         self.gathered += 1
         return float(loss), similarity
 
-    def step(self) -> int:
-        """An Adam step with the mean of the gathered gradients, then pruning; the number of dropped codewords."""
+    def expand(self, features: Tensor, similarity: Tensor) -> Tensor:  # [n, D], [n] -> [m] int64
+        """The features that join because no codeword is similar enough to them (Eq. 8), in the order of joining.
+
+        Ties go to the lowest row. (The released script may exceed K_max by one.)
+        """
+        alpha, most = self.options.expand_below, self.options.joins_per_image
+        room = self.options.maximum - len(self.rows)
+        rows = (similarity < alpha).nonzero()[:, 0][: None if room else 0]
+        if most is None:
+            return rows[similarity[rows].argsort(stable=True)[:room]]
+        return rows[farthest_first(unit_rows(features[rows]), similarity[rows], alpha, min(room, most))]
+
+    def step(self) -> None:
+        """An Adam step with the mean of the gathered gradients."""
         if self.gathered == 0:  # every feature was zero
-            return 0
+            return
         state, (decay1, decay2) = self.state, BETAS
         gradient, steps = state["gradient"] / self.gathered, state["steps"] + 1
         first, second = state["first"].lerp(gradient, 1 - decay1), decay2 * state["second"]
         second = second + (1 - decay2) * gradient.square()
         bias1, bias2 = ((1 - decay**steps).to(gradient.dtype) for decay in BETAS)
         rows = self.rows - self.options.learning_rate * (first / bias1) / ((second / bias2).sqrt() + ADAM_EPS)
-        stays = prune(rows, threshold=self.options.prune_above)
-        moved = _fresh(rows) | {"first": first, "second": second, "steps": steps}
-        self.state, self.gathered = {name: value[stays] for name, value in moved.items()}, 0
-        return len(rows) - len(stays)
+        self.state = _fresh(rows) | {"first": first, "second": second, "steps": steps}
+        self.gathered = 0
+
+    def prune(self) -> int:
+        """Drop codewords that are too similar (Eq. 9); their number."""
+        stays = prune(self.rows, threshold=self.options.prune_above)
+        dropped = len(self.rows) - len(stays)
+        if dropped:
+            self.state = {name: value[stays] for name, value in self.state.items()}
+        return dropped
 
 
 def _fresh(rows: Tensor) -> dict[str, Tensor]:
@@ -169,50 +199,14 @@ def _fresh(rows: Tensor) -> dict[str, Tensor]:
     return {"rows": rows, "steps": torch.zeros(len(rows), 1, dtype=torch.float64, device=rows.device), **zeros}
 
 
-def expand(features: Tensor, similarity: Tensor, *, threshold: float, room: int) -> Tensor:  # [n, D], [n] -> [m] int64
-    """Choose the features that join the codebook because no codeword is similar enough to them (Eq. 8).
-
-    The least similar feature joins first; similarities are then updated, and so on until every feature is at least
-    `threshold` (alpha) similar to a codeword, or `room` have joined: farthest-point sampling that starts from the codebook. So
-    each feature is below the threshold at the moment it joins, and near-duplicates never fill the book.
-
-    Returns:
-        Rows of `features` in the order of joining. Ties go to the lowest row; all-zero rows never join.
-
-    Note:
-        The paper admits in batches every feature below alpha; its released script takes the least similar ones without
-        updating similarities, and may exceed K_max by one.
-    """
-    rows = (similarity < threshold).nonzero()[:, 0][: None if room > 0 else 0]
-    rows = rows[row_norms(features[rows]) > EPS]
-    unit, best = unit_rows(features[rows]), similarity[rows].clone()
-    chosen: list[int] = []
-    while len(chosen) < room and best.numel() > 0:
-        least = int(best.argmin())
-        if not float(best[least]) < threshold:
-            break
-        chosen.append(least)
-        best = torch.maximum(best, unit @ unit[least])
-        best[least] = torch.inf  # present now, whatever rounding makes of its cosine with itself
-    return rows[torch.tensor(chosen, dtype=torch.int64, device=rows.device)]
-
-
 def prune(codewords: Tensor, *, threshold: float) -> Tensor:  # [K, D] -> [K'] int64, ascending
     """Choose the codewords that stay when the later of any two that are too similar is dropped (Eq. 9).
 
-    Codewords are visited in order, and one is dropped if its cosine with an earlier one *that stays* exceeds `threshold`
-    (the paper's beta). So each dropped codeword has a stand-in, and pruning twice changes nothing.
-
-    Note:
-        The paper drops f_g of a pair e < g, the released script f_e.
+    All pairs e < g of the codebook count, as printed: f_g goes if its cosine with any earlier f_e exceeds `threshold` (beta),
+    even if f_e goes as well. (The released script drops f_e.) Pruning twice changes nothing.
     """
     unit = unit_rows(codewords)
-    close = (unit @ unit.T > threshold).triu(diagonal=1).cpu()  # K is small
-    stays = torch.ones(len(codewords), dtype=torch.bool)
-    for e in close.any(dim=1).nonzero()[:, 0].tolist():
-        if stays[e]:
-            stays &= ~close[e]
-    return stays.nonzero()[:, 0].to(codewords.device)
+    return (~(unit @ unit.T > threshold).triu(diagonal=1).any(dim=0)).nonzero()[:, 0]
 
 
 def class_balanced_loss(
