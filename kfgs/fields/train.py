@@ -142,9 +142,8 @@ class Trainer:
         self._sh_start = 0 if gaussians.features is not None or gaussians.sh is None else used_sh_degree(gaussians.sh)
         self.statistics = GradientStatistics.zeros(gaussians.means)
         self.history: list[dict[str, Any]] = []
-        self.step = 0
         self._queue: list[int] = []  # views still to come in this epoch, last first
-        self._losses, self._seconds = 0.0, 0.0
+        self.step, self._losses, self._seconds = 0, 0.0, 0.0
 
     def gaussians(self, sh_degree: int | None = None) -> Gaussians:
         """The cloud as it is now, differentiable; of colours, only harmonics up to `sh_degree` (None: all)."""

@@ -104,11 +104,23 @@ def test_a_target_that_needs_a_gradient_gets_one(measure):
     torch.testing.assert_close(found, expected)
 
 
-@pytest.mark.parametrize(("size", "shown"), [((4, 3), 1.0), ((12, 9), 1.0), ((4, 30), 1 / 3)])
-def test_every_rendered_pixel_learns_from_a_small_target(size, shown):
-    rendered = torch.rand(24, 18, 2, generator=torch.Generator().manual_seed(0)).requires_grad_()
-    loss = l1_loss(rendered, torch.ones(24, 18), torch.full((*size, 2), 2.0))
+@pytest.mark.parametrize("size", [(4, 3), (5, 7), (12, 9), (4, 30), (24, 18)])
+def test_every_rendered_pixel_learns_from_a_small_target(size):
+    g = torch.Generator().manual_seed(0)
+    rendered, target = torch.rand(24, 18, 2, generator=g).requires_grad_(), torch.rand(*size, 2, generator=g)
+    loss = l1_loss(rendered, torch.ones(24, 18), target)
     loss.backward()
-    assert float(rendered.grad.ne(0).any(dim=2).double().mean()) == pytest.approx(shown)
-    if size == (4, 3):  # each of its pixels is the mean of 6 x 6
-        assert loss.item() == pytest.approx(2 - rendered.mean().item())
+    assert rendered.grad.ne(0).any(dim=2).all()
+    if size == (4, 3):  # repeated three times, then each pixel is compared with the mean of 2 x 2
+        blocks = rendered.detach().unfold(0, 2, 2).unfold(1, 2, 2).mean(dim=(3, 4))
+        repeated = target[torch.arange(12) // 3][:, torch.arange(9) // 3]
+        assert loss.item() == pytest.approx((blocks - repeated).abs().mean().item())
+
+
+def test_at_the_papers_ratio_the_loss_is_plain_bilinear():
+    g = torch.Generator().manual_seed(1)
+    rendered, target = torch.rand(48, 64, 3, generator=g), torch.rand(36, 48, 3, generator=g)
+    small = torch.nn.functional.interpolate(rendered.permute(2, 0, 1)[None], (36, 48), mode="bilinear")[0].permute(
+        1, 2, 0
+    )
+    assert torch.equal(l1_loss(rendered, rendered[..., 0], target), (small - target).abs().sum() * (1 / target.numel()))
