@@ -22,7 +22,8 @@ from kfgs.fields import Training, UpliftConfig, fit_field, uplift_maps
 from kfgs.gaussians import Gaussians
 from kfgs.metrics import semantic_storage_bytes
 from kfgs.quant.autoencoder import quick_on_a_cpu
-from kfgs.splat import covariance_3d, rasterize
+from kfgs.splat import rasterize
+from kfgs.splat.covariance import covariance_3d
 from kfgs.splat.views import sum_pixels
 
 from .common import Clock, Fitted, Task, seeded, within

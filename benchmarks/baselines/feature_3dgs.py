@@ -10,7 +10,8 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.nn.functional import interpolate
+
+from kfgs.cameras import resize_map
 
 from .common import FLOAT, Clock, Fitted, KeptMaps, Task, is_shown, seeded
 from .methods import LinearDecoder, RenderedMethod
@@ -63,9 +64,7 @@ class Features(torch.nn.Module):
 
     def loss(self, rendered: Tensor, target: Tensor, step: int) -> Tensor:  # [H, W, d], [h, w, D] -> []
         """The mean over all pixels and channels of |conv(resize(rendered)) - teacher|."""
-        height, width, _ = target.shape
-        planes = rendered.permute(2, 0, 1)[None]
-        small = interpolate(planes, (height, width), mode="bilinear", align_corners=True)[0].permute(1, 2, 0)
+        small = resize_map(rendered, (target.shape[0], target.shape[1]), align_corners=True)
         found = small if self.convolution is None else self.convolution(small)
         return (found - target).abs().mean()
 

@@ -3,8 +3,8 @@
 from .camera import Camera, Distortion
 from .paths import Orbit, estimate_up, orbit_cameras, path_cameras, robust_bounds
 from .projection import from_kornia, project_points, to_kornia
-from .resample import resize_map, undistort
-from .similarity import Similarity, fit_similarity
+from .resample import from_bchw, resize_map, to_bchw, undistort
+from .similarity import Similarity
 
 __all__ = [
     "Camera",
@@ -12,13 +12,14 @@ __all__ = [
     "Orbit",
     "Similarity",
     "estimate_up",
-    "fit_similarity",
+    "from_bchw",
     "from_kornia",
     "orbit_cameras",
     "path_cameras",
     "project_points",
     "resize_map",
     "robust_bounds",
+    "to_bchw",
     "to_kornia",
     "undistort",
 ]

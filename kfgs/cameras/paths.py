@@ -100,8 +100,6 @@ class Orbit:
     """(height, width) in pixels."""
     elevation_degrees: float = 25.0
     """Angle above the horizon, seen from the middle, in (-90, 90)."""
-    start_degrees: float = 0.0
-    """Direction of the first camera from the middle, counter-clockwise seen from above."""
     fov_degrees: float = 40.0
     """Vertical field of view."""
     zoom: float = 1.0
@@ -222,8 +220,7 @@ def orbit_cameras(
     north /= north.norm()
     east, e = torch.linalg.cross(north, zenith), radians(orbit.elevation_degrees)
     cameras = []
-    for number in range(orbit.frames):
-        a = radians(orbit.start_degrees) + 2 * pi * number / orbit.frames
+    for number, a in enumerate(np.linspace(0, 2 * pi, orbit.frames, endpoint=False)):
         outward = cos(e) * (cos(a) * east + sin(a) * north) + sin(e) * zenith
         view = Camera.look_at(
             center + distance * outward, center, up=zenith, fov_degrees=orbit.fov_degrees,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
@@ -15,19 +16,23 @@ from .._check import as_tensor, check_shapes, check_size
 from .camera import Camera
 from .projection import fold_radius, plane_to_pixel
 
+SMALL = 8  # cells: the aspect of a smaller map says little
+
 
 def to_bchw(map: Tensor) -> Tensor:  # [H, W, D] -> [1, D, H, W]
-    """A map in kornia's layout: a view, without copying.
+    """A map in the layout of kornia and of networks: a view, without copying.
 
     The batch axis is added *before* permuting, so that torch sees its channels-last memory order and resizes about 8 times
     faster (64 channels, 640x480 to 480x360: 32 against 160 ms on one thread).
     """
+    check_shapes(("map", map, "H W D"))
     return map[None].permute(0, 3, 1, 2)
 
 
-def from_bchw(batch: Tensor) -> Tensor:  # [1, D, H, W] -> [H, W, D]
-    """A batch of one as a map: a view, the inverse of `to_bchw`."""
-    return batch.permute(0, 2, 3, 1)[0]
+def from_bchw(batch: Tensor) -> Tensor:  # [1, D, H, W] or [D, H, W] -> [H, W, D]
+    """A batch of one, or one of its items, as a map: a view, the inverse of `to_bchw`."""
+    check_shapes(("batch", batch, (1, "D", "H", "W") if batch.ndim > 3 else "D H W"))
+    return (batch if batch.ndim == 3 else batch[0]).permute(1, 2, 0)
 
 
 def resize_map(
@@ -35,6 +40,7 @@ def resize_map(
     size: tuple[int, int],  # (h, w)
     *,
     antialias: bool = False,
+    align_corners: bool = False,
 ) -> Tensor:  # [h, w, D]
     """Resize a map bilinearly, differentiably: the sampling of Eq. 4, from the rendered size to the teacher's.
 
@@ -42,10 +48,11 @@ def resize_map(
     paper is silent; its released script uses True, which moves samples by up to 0.17 pixel at 639x479 -> 480x360.
 
     Args:
-        map: any number of channels, floating point (resize labels with `resize_labels`).
+        map: any number of channels, last (`from_bchw`), floating point (resize labels with `resize_labels`).
         size: (height, width) of the result.
         antialias: blur before shrinking (kornia's Gaussian). It matters from a factor of about 2, where plain bilinear sampling
             skips pixels and leaves them without gradient.
+        align_corners: True puts the centres of corner pixels on each other, as LSeg and the paper's script do.
     """
     map = as_tensor("map", map)
     check_shapes(("map", map, "H W D"))
@@ -54,7 +61,8 @@ def resize_map(
     check_size(size)
     if map.shape[:2] == tuple(size):
         return map
-    return from_bchw(resize(to_bchw(map), tuple(size), align_corners=False, antialias=antialias))
+    check_layout("map", map.shape, size)
+    return from_bchw(resize(to_bchw(map), tuple(size), align_corners=align_corners, antialias=antialias))
 
 
 def resize_labels(labels: Tensor, size: tuple[int, int]) -> Tensor:  # [H, W] integer -> [h, w], dtype of labels
@@ -81,6 +89,15 @@ def fits_aspect(size: tuple[int, int], other: tuple[int, int]) -> bool:
     return abs(h - H * w / W) <= 1 or abs(w - W * h / H) <= 1
 
 
+def check_layout(name: str, shape: Sequence[int], size: tuple[int, int]) -> None:
+    """Raise a ValueError if a map of a picture of `size` is [D, h, w]: its last two axes have that aspect, its first two not."""
+    first, middle, last = shape
+    tells = first != middle and min(middle, last) >= SMALL  # an encoder's grid may be square, whatever the picture
+    if tells and not fits_aspect((first, middle), size) and fits_aspect((middle, last), size):
+        got = f"{tuple(shape)}, whose channels are first; convert it with kfgs.cameras.from_bchw"
+        raise ValueError(f"{name}: expected [h, w, D] in the shape of {size[0]} x {size[1]}, got {got}")
+
+
 def undistort(image: Tensor, camera: Camera) -> tuple[Tensor, Camera, Tensor]:  # image: [H, W, C]; also the mask [H, W]
     """Undistort a picture or a feature map; K, pose and size stay.
 
@@ -103,41 +120,36 @@ def undistort(image: Tensor, camera: Camera) -> tuple[Tensor, Camera, Tensor]:  
     if camera.distortion is None:
         return image, camera, torch.ones(camera.size, dtype=torch.bool, device=image.device)
     dtype = torch.promote_types(image.dtype, torch.float32)  # half precision cannot tell the pixels of a row apart
-    x, y, recorded = _source_positions(camera, dtype, image.device)
-    # with remap's default align_corners even an identity map changes the picture (kornia#4504)
-    result = remap(to_bchw(image.to(dtype)), x[None], y[None], padding_mode="border", align_corners=True)
-    result = from_bchw(result).where(recorded[..., None], 0).to(image.dtype)
-    return result, replace(camera, distortion=None), recorded
+    result, recorded = _straightened(image.to(dtype), camera, "bilinear")
+    return result.to(image.dtype), replace(camera, distortion=None), recorded
 
 
 def undistort_labels(labels: Tensor, camera: Camera) -> Tensor:  # [H, W] integer -> [H, W], dtype of labels
-    """Remove the lens from a label map: each pixel takes the label of the nearest distorted pixel, unrecorded ones -1.
-
-    Indexed directly, because kornia's `remap` takes floating point only.
-    """
+    """Remove the lens from a label map: each pixel takes the label of the nearest distorted pixel, unrecorded ones -1."""
     check_shapes(("labels", labels, f"{camera.height} {camera.width}"))
     if labels.is_floating_point() or not torch.iinfo(labels.dtype).min:
         raise TypeError(f"labels: expected signed integers, got {labels.dtype}; convert them with .long()")
     if camera.distortion is None:
         return labels
-    x, y, recorded = _source_positions(camera, torch.promote_types(camera.K.dtype, torch.float32), labels.device)
-    rows = (y + 0.5).floor().long().clamp(0, camera.height - 1)
-    columns = (x + 0.5).floor().long().clamp(0, camera.width - 1)
-    return labels[rows, columns].where(recorded, -1)
+    result, recorded = _straightened(labels[..., None].double(), camera, "nearest")
+    return result[..., 0].to(labels.dtype).where(recorded, -1)
 
 
-def _source_positions(
-    camera: Camera, dtype: torch.dtype, device: torch.device
-) -> tuple[Tensor, Tensor, Tensor]:  # [H, W], [H, W], [H, W] bool
-    """Where in the distorted picture each undistorted pixel lies, counting pixel *centres* from 0, and whether it does.
+def _straightened(
+    map: Tensor, camera: Camera, mode: str
+) -> tuple[Tensor, Tensor]:  # [H, W, C] -> [H, W, C], [H, W] bool
+    """A map without the lens, 0 where nothing was recorded, and where something was.
 
-    kornia's grid and remap put centres on integers, so K is shifted by half a pixel here.
+    kornia's grid and remap put pixel centres on integers, so K is shifted by half a pixel here.
     """
     assert camera.distortion is not None
     height, width = camera.size
-    K = camera.intrinsics_at_integer_centers.to(device=device, dtype=dtype)
-    grid = create_meshgrid(height, width, normalized_coordinates=False, device=device, dtype=dtype)[0]
+    K = camera.intrinsics_at_integer_centers.to(map)
+    grid = create_meshgrid(height, width, normalized_coordinates=False, device=map.device, dtype=map.dtype)[0]
     plane = normalize_points_with_intrinsics(grid, K)
     x, y = plane_to_pixel(plane, K, camera.distortion).unbind(-1)
     recorded = (x >= -0.5) & (x < width - 0.5) & (y >= -0.5) & (y < height - 0.5)
-    return x, y, recorded & (plane.norm(dim=-1) < fold_radius(camera.distortion))
+    recorded &= plane.norm(dim=-1) < fold_radius(camera.distortion)
+    # with remap's default align_corners even an identity map changes the picture (kornia#4504)
+    result = remap(to_bchw(map), x[None], y[None], mode=mode, padding_mode="border", align_corners=True)
+    return from_bchw(result).where(recorded[..., None], 0), recorded

@@ -13,7 +13,6 @@ from .._origin import FAR_UNITS, Origin
 from .camera import Camera, exact_rotation
 
 LAST_ROW_TOLERANCE = 1e-5  # a float32 matrix inverse leaves 1e-7 there
-STRAIGHT = 1e-6  # points whose second spread is below this share of the first lie on a line
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,23 +106,14 @@ class Similarity:
         return replace(self, translation=torch.zeros(3)), (x, y, z)
 
 
-def fit_similarity(src: Tensor, dst: Tensor) -> Similarity:  # [N, 3], [N, 3]
+def fit_similarity(src: Tensor, dst: Tensor) -> Similarity:  # [N, 3], [N, 3] float64, at least three that span a plane
     """The similarity with the least sum of |s R src + t - dst|^2, in closed form (Umeyama 1991, by scikit-image).
 
-    Flat clouds are accepted (the result is the rotation, not the mirror image). A ValueError if fewer than three pairs span a
-    plane in both frames: the rotation about a line is unknown.
+    Of flat clouds it is the rotation, not the mirror image. A ValueError if no similarity fits.
     """
     from skimage.transform import SimilarityTransform  # slow to import, and seldom needed
 
-    points = [as_tensor(name, values).detach().double().cpu() for name, values in (("src", src), ("dst", dst))]
-    check_shapes(("src", points[0], "N 3"), ("dst", points[1], "N 3"))
-    for name, values in zip(("src", "dst"), points, strict=True):
-        if len(values) < 3 or not torch.isfinite(values).all():
-            raise ValueError(f"{name}: expected at least 3 finite points, got {len(values)}; add pairs, leave NaN out")
-        spread = torch.linalg.svdvals(values - values.mean(0))
-        if spread[1] <= STRAIGHT * spread[0]:
-            raise ValueError(f"{name}: expected points that span a plane, got points on a line; add pairs next to it")
-    fit = SimilarityTransform.from_estimate(*(values.numpy() for values in points))
+    fit = SimilarityTransform.from_estimate(src.numpy(), dst.numpy())
     if not fit or not fit.scale > 0:
         raise ValueError("dst: expected points that a rotation and a scale can reach, got others; check the pairs")
     return Similarity.from_matrix(torch.from_numpy(fit.params))

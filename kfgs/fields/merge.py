@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ..gaussians import Gaussians
 from ..quant.grow import group_sums, spherical_kmeans
-from ..splat import covariance_3d
+from ..splat.covariance import covariance_3d
 
 CLUSTERS = 64
 """Kinds of features that are never merged with each other: they keep neighbours apart that mean different things. 32 and 64 gave

@@ -24,8 +24,8 @@ from ..formats.sidecar import write_names
 from ..gaussians import Gaussians
 from ..labels import LabelSet, Transfer, nearest_labels, number_instances
 from ..labels.transfer import without_instances
-from ..scenes import SceneError, align_by_cameras, frames_agree
-from ..scenes.frames import Alignment
+from ..scenes import SceneError, align_by_cameras
+from ..scenes.frames import Alignment, frames_agree
 from ..splat import transform_gaussians, vote_labels
 from ..splat.sh import rgb_to_sh0
 from ..viz import palette

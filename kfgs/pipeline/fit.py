@@ -21,6 +21,7 @@ from torch import Tensor
 
 from .._check import Progress, as_progress
 from .._files import check_output, folded_name, locked, real_path, write_json
+from ..cameras.resample import check_layout
 from ..fields import SemanticField, fit_field, fuse_views, gaussians_from_points, uplift_maps
 from ..fields.decoders import Autoencoded, Codewords, Decoder, Identity
 from ..fields.store import NAME, check_place, scene_classes
@@ -130,6 +131,8 @@ def _open_maps(maps: Any, scene: Scene, split: str, folder: Path, progress: bool
         )
     if hasattr(maps, "check_files"):
         maps.check_files()
+    else:
+        check_layout("maps[0]", map_shape(maps), scene.cameras[scene.views(split)[0]].size)
     return maps
 
 

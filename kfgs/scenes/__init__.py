@@ -3,7 +3,7 @@
 from .extract import extract_features, save_feature_map
 from .feature_maps import FeatureFolder
 from .files import SceneError, list_images, read_image
-from .frames import align_by_cameras, frames_agree
+from .frames import align_by_cameras
 from .known_poses import find_points
 from .load import load_cameras, load_scene
 from .scene import Scene
@@ -17,7 +17,6 @@ __all__ = [
     "align_by_cameras",
     "extract_features",
     "find_points",
-    "frames_agree",
     "list_images",
     "load_cameras",
     "load_scene",

@@ -1,6 +1,5 @@
 """Gaussian splatting: project, bin, composite."""
 
-from .covariance import covariance_3d
 from .engines import (
     ALPHA_MIN,
     accumulate_pixels,
@@ -11,7 +10,6 @@ from .engines import (
 from .engines.contract import Ranked
 from .project import Projected, project
 from .rasterize import Rendering, rasterize, rasterize_labels
-from .sh import evaluate_sh
 from .tiles import Tiles, bin_tiles
 from .transform import transform_gaussians
 from .views import average_views, vote_labels
@@ -27,8 +25,6 @@ __all__ = [
     "average_views",
     "bin_tiles",
     "composite",
-    "covariance_3d",
-    "evaluate_sh",
     "free_memory",
     "project",
     "rasterize",

@@ -9,7 +9,8 @@ from small_task import MIB, cameras, cloud, task
 from kfgs._rows import unit_rows
 from kfgs.cameras import resize_map
 from kfgs.evaluation import View
-from kfgs.splat import covariance_3d, rasterize
+from kfgs.splat import rasterize
+from kfgs.splat.covariance import covariance_3d
 
 LEARNS_CODES = legaussians.LEGaussiansConfig(
     codes=4, epochs=150, code_rate=1e-2, steps=150, feature_rate=2e-2, network_rate=1e-2

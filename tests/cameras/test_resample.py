@@ -2,7 +2,7 @@ import pytest
 import torch
 from messages import refused, tells
 
-from kfgs.cameras import resize_map
+from kfgs.cameras import from_bchw, resize_map, to_bchw
 from kfgs.cameras.resample import fits_aspect, resize_labels
 
 
@@ -18,10 +18,6 @@ def test_ramp_of_pixel_centers_stays_exact():
     source = ramp(height, width)
     expected = ramp(h, w) * torch.tensor([width / w, height / h], dtype=torch.float64)
     torch.testing.assert_close(resize_map(source, (h, w)), expected)
-
-
-def test_size_is_height_then_width_and_channels_stay_last():
-    assert resize_map(torch.zeros(8, 6, 5), (4, 3)).shape == (4, 3, 5)
 
 
 @pytest.mark.parametrize("size", [(3, 4), (9, 11)])
@@ -63,16 +59,30 @@ def test_resample_refusals():
         refused(lambda size=size: resize_map(torch.zeros(4, 5, 1), size), "size", "height", f"got {got}")
 
 
+def test_channels_first_are_noticed_and_turned():
+    batch = torch.rand(1, 8, 34, 46, generator=torch.Generator().manual_seed(0))
+    refused(lambda: resize_map(batch[0], (68, 92)), "map:", "68 x 92", "got (8, 34, 46)", "kfgs.cameras.from_bchw")
+    map = from_bchw(batch)
+    assert torch.equal(map, from_bchw(batch[0]))
+    assert torch.equal(map[3, 5], batch[0, :, 3, 5])
+    assert torch.equal(to_bchw(map), batch)
+    refused(lambda: from_bchw(batch.repeat(2, 1, 1, 1)), "batch:", "[1, D, H, W]", "got (2, 8, 34, 46)")
+    for shape, size in (
+        ((34, 46, 8), (68, 92)),
+        ((24, 24, 32), (48, 64)),
+        ((24, 18, 2), (4, 30)),
+        ((30, 4, 3), (4, 4)),
+    ):
+        assert resize_map(torch.zeros(shape), size).shape == (*size, shape[2])  # right ones, also to another aspect
+
+
 @pytest.mark.parametrize(
     ("cells", "size", "fits"),
     [
         ((90, 120), (360, 480), True),
-        ((24, 32), (360, 480), True),
         ((26, 64), (430, 1036), True),  # 26.6 rows, cut
-        ((27, 64), (430, 1036), True),  # and rounded
         ((48, 64), (479, 640), True),
         ((120, 90), (360, 480), False),
-        ((90, 90), (360, 480), False),
         ((92, 120), (360, 480), False),
     ],
 )

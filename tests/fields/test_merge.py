@@ -10,7 +10,8 @@ from kfgs.cameras import Camera
 from kfgs.fields import merge
 from kfgs.fields.merge import merge_gaussians
 from kfgs.gaussians import Gaussians
-from kfgs.splat import covariance_3d, rasterize
+from kfgs.splat import rasterize
+from kfgs.splat.covariance import covariance_3d
 
 
 @pytest.fixture(autouse=True)

@@ -60,7 +60,7 @@ def test_two_points_and_identical_points():
 
 
 def test_a_colour_field_shows_its_points_colours():
-    from kfgs.splat import evaluate_sh
+    from kfgs.splat.sh import evaluate_sh
 
     colors = torch.randint(0, 256, (400, 3), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
     colors[0] = torch.tensor([0, 128, 255])

@@ -6,7 +6,8 @@ from scipy.spatial.transform import Rotation
 from kfgs import Gaussians
 from kfgs.cameras import Similarity
 from kfgs.formats.values import flip_axes
-from kfgs.splat import evaluate_sh, transform_gaussians
+from kfgs.splat import transform_gaussians
+from kfgs.splat.sh import evaluate_sh
 
 
 @pytest.mark.parametrize("axes", [(1, -1, -1), (-1, 1, 1), (1, 1, -1), (-1, -1, -1)])

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from kfgs.cli import main
 from kfgs.formats import find_format, read_splats, write_splats
 from kfgs.formats.checkpoint import FRAME
-from kfgs.splat import evaluate_sh
+from kfgs.splat.sh import evaluate_sh
 
 N = 7
 # x' = 0.5 (R x + t) with a quarter turn about z, and t

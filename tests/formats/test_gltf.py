@@ -11,7 +11,7 @@ from messages import refused, tells
 from scipy.spatial.transform import Rotation
 
 from kfgs.formats import read_splats, write_splats
-from kfgs.splat import evaluate_sh
+from kfgs.splat.sh import evaluate_sh
 
 
 def _values(document: pygltflib.GLTF2, attribute: str) -> np.ndarray:

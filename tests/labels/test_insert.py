@@ -9,7 +9,8 @@ from kfgs.cameras import Similarity
 from kfgs.formats import write_splats
 from kfgs.labels import Insert
 from kfgs.labels.edit_list import join
-from kfgs.splat import evaluate_sh, transform_gaussians
+from kfgs.splat import transform_gaussians
+from kfgs.splat.sh import evaluate_sh
 
 
 def splats(n, coefficients=1, labels=None, classes=(), extra=None, seed=0, dtype=torch.float32):

@@ -6,7 +6,8 @@ from messages import refused
 from oracles_selection import rotation
 
 from kfgs.labels import Duplicate, Move
-from kfgs.splat import covariance_3d, evaluate_sh
+from kfgs.splat.covariance import covariance_3d
+from kfgs.splat.sh import evaluate_sh
 
 MOTIONS = (
     {"translation": (1.0, -2.0, 0.5)},

@@ -181,6 +181,7 @@ def test_bad_input_is_refused_before_any_work(scene, room, maps, splat, tmp_path
     for arguments, error, words in (
         ((scene, two), ValueError, ("maps:", "6 views of split 'train'", "got 2")),
         ((scene, backwards), ValueError, ("maps:", "order (view_")),
+        ((scene, [m.permute(2, 0, 1) for m in maps]), ValueError, ("maps[0]:", "channels are first", "from_bchw")),
         ((bent, maps), ValueError, ("scene:", "distortion", "scene.undistorted()")),
         ((scene, "features"), TypeError, ("maps", "str", "FeatureFolder")),
         ((scene, ["a.npy"]), TypeError, ("maps[0]", "str")),

@@ -3,7 +3,7 @@ import torch
 from messages import refused
 from scipy.spatial.transform import Rotation
 
-from kfgs.splat import covariance_3d
+from kfgs.splat.covariance import covariance_3d
 
 
 def _random(N=20, seed=0):

@@ -5,9 +5,8 @@ import torch
 from messages import refused
 from scipy.spatial.transform import Rotation
 
-from kfgs.splat import evaluate_sh
 from kfgs.splat.engines.table import load
-from kfgs.splat.sh import SH_C0, rgb_to_sh0, rotate_sh, sh0_to_rgb
+from kfgs.splat.sh import SH_C0, evaluate_sh, rgb_to_sh0, rotate_sh, sh0_to_rgb
 
 
 def _directions(N=50, seed=0):

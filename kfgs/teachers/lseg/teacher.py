@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
+from kornia.geometry.transform import resize
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -126,7 +127,7 @@ class LSeg(nn.Module):
         size = self.options.map_size(image.shape[1], image.shape[2], window=window)
         picture = image.to(self._device(), torch.float32) * 2 - 1
         if size != tuple(image.shape[1:]):
-            picture = functional.interpolate(picture[None], size=size, mode="bilinear", align_corners=True)[0]
+            picture = resize(picture, size, align_corners=True)
         return multi_scale_features(
             picture, self._head, window=window, scales=self.options.scales, flip=self.options.flip
         )

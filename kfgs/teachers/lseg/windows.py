@@ -18,6 +18,7 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
+from kornia.geometry.transform import resize
 from torch import Tensor
 from torch.nn import functional
 
@@ -75,7 +76,7 @@ def multi_scale_features(
     result: Tensor | None = None
     for scale in scales:
         h, w = scaled_size(H, W, scale, window)
-        image = functional.interpolate(picture[None], size=(h, w), mode="bilinear", align_corners=True)
+        image = resize(picture[None], (h, w), align_corners=True)
         rows, columns = _parts(h, H, window), _parts(w, W, window)
         for row in rows:
             for column in columns:
@@ -120,13 +121,5 @@ def _parts(length: int, out: int, window: int) -> list[_Part]:
 
 
 def _interpolation(source: int, target: int) -> Tensor:  # [target, source] float64
-    """The matrix of linear interpolation with aligned corners, from `source` samples to `target`; one sample is the first."""
-    step = (source - 1) / (target - 1) if target > 1 else 0.0
-    position = torch.arange(target, dtype=torch.float64) * step
-    below = position.floor().long().clamp(max=max(source - 2, 0))
-    weight = position - below
-    matrix = torch.zeros(target, source, dtype=torch.float64)
-    matrix[torch.arange(target), below] = 1 - weight
-    if source > 1:
-        matrix[torch.arange(target), below + 1] += weight
-    return matrix
+    """The matrix of linear interpolation with aligned corners, from `source` samples to `target`: unit vectors, resized."""
+    return resize(torch.eye(source, dtype=torch.float64)[None, None], (target, source), align_corners=True)[0, 0]
