@@ -26,6 +26,7 @@ from kfgs._files import read_json, write_json
 from kfgs._rows import unit_rows
 from kfgs.cameras import Camera
 from kfgs.evaluation import FieldMethod, LabelTruth, Method, TeacherMethod, View, label_view
+from kfgs.evaluation.method import LabelRule
 from kfgs.evaluation.segmentation import SegmentationReport, evaluate_segmentation
 from kfgs.evaluation.teacher_agreement import TeacherAgreement
 from kfgs.fields import Linear, SemanticField, Training
@@ -241,6 +242,7 @@ def make_baseline(row: Row, room: Room, request: dict[str, Any], folder: Path) -
 def make_kfgs(row: Row, room: Room, request: dict[str, Any], folder: Path) -> Made:
     """Fit one of kfgs's own rows."""
     method = kfgs_config(row, *(request[name] for name in ("row", "preset", "steps")))
+    rule: LabelRule = "own" if row.mode is None or row.own else "paper"  # Sec. 3.4: decode, quantise, look up
     if isinstance(method, Uplift):
         method = replace(method, splat=request["splat"])
     shutil.rmtree(folder / "run", ignore_errors=True)  # stages of a killed run would count too few seconds
@@ -255,9 +257,9 @@ def make_kfgs(row: Row, room: Room, request: dict[str, Any], folder: Path) -> Ma
 
     def on(device: torch.device) -> tuple[Method, Callable[[Camera], Any]]:
         moved = field.to(device)
-        return FieldMethod(moved), moved.render
+        return FieldMethod(moved, rule=rule), moved.render
 
-    return Made(FieldMethod(field), facts, FieldMethod(field, own_labels=False), field_codec(field), on)
+    return Made(FieldMethod(field, rule=rule), facts, FieldMethod(field, rule="nearest"), field_codec(field), on)
 
 
 def field_codec(field: SemanticField) -> Callable[[torch.Tensor], torch.Tensor] | None:

@@ -57,7 +57,7 @@ def run(dim: int, room: Room, args: argparse.Namespace) -> dict[str, Any]:
     file = args.out / "rows" / f"{dim}-{digest_value(asked)[:12]}.json"
     if file.is_file():
         return dict(read_json(file))
-    scored, nearest = FieldMethod(field), FieldMethod(field, own_labels=False)
+    scored, nearest = FieldMethod(field, rule="paper"), FieldMethod(field, rule="nearest")
     seconds = field.info["seconds"]
     moved, shown = field.to(args.device), views_on(room.views[:FPS_VIEWS], args.device)
     row = {

@@ -79,22 +79,23 @@ def test_every_protocol_end_to_end(words, shown, run, room, tmp_path, capsys):
 def test_the_rule_for_labels_is_that_of_the_protocol_unless_asked(run, room, words, asked, tmp_path, capsys):
     field = SemanticField.load(run)
     expected = {
-        rule: KfgsPooled().score(FieldMethod(field, own_labels=rule == "own"), *asked, lambda _: words.embeddings)
-        for rule in ("own", "nearest")
+        rule: KfgsPooled().score(FieldMethod(field, rule=rule), *asked, lambda _: words.embeddings)
+        for rule in ("own", "nearest", "paper")
     }
     assert expected["own"].scores != expected["nearest"].scores
     capsys.readouterr()
-    for given, rule in (((), "own"), (("--labels", "own"), "own"), (("--labels", "nearest"), "nearest")):
+    for rule in (None, *expected):
+        given, rule = () if rule is None else ("--labels", rule), rule or "own"
         said = scored(capsys, run, *given, "--out", tmp_path / f"{rule}.json")
         kept = json.loads((tmp_path / f"{rule}.json").read_text())
         assert kept["scores"] == dict(expected[rule].scores)
         assert kept["options"]["labels"] == rule
-        assert ("labels=nearest" in said.splitlines()[0]) == (rule == "nearest")
+        assert (f"labels={rule}" in said.splitlines()[0]) == (rule != "own")
     question = open_question(room, "feature3dgs-teacher")
     published, own = (evaluate(run, question, encode=words, labels=rule) for rule in (None, "own"))
     assert (published.options["labels"], published.changed) == ("nearest", ("texts",))
     assert (own.options["labels"], own.changed) == ("own", ("texts", "labels"))
-    method = FieldMethod(field, own_labels=False)
+    method = FieldMethod(field, rule="nearest")
     pooled = open_question(room)
     assert evaluate(method, pooled, encode=words).options["labels"] == "nearest"  # its rule, unless one is asked
     assert evaluate(method, pooled, encode=words, labels="own").scores == expected["own"].scores

@@ -60,7 +60,7 @@ class OVS3DClosed:
         "accuracy = share of pixels whose whole one-hot row is right"
     )
     open = staticmethod(open_masks)
-    own_labels: ClassVar[bool] = False
+    rule: ClassVar[str] = "nearest"
     """Every method takes the text with the largest cosine."""
 
     texts: tuple[str, ...] = ()

@@ -126,7 +126,7 @@ def _truth_of(question: Question, view: View, encode: Encode) -> tuple[Tensor, S
         labels = stored if isinstance(stored, Tensor) else load_label_map(stored)
         return labels.cpu(), truth.names, list(range(len(truth.names)))
     if isinstance(truth, MaskTruth):
-        closed = hasattr(question.protocol, "own_labels")  # pixels choose from all texts, not from those of the view
+        closed = hasattr(question.protocol, "rule")  # pixels choose from all texts, not from those of the view
         texts = (question.protocol.texts or truth.listed or truth.texts) if closed else truth.texts
         labels = torch.full(view.camera.size, -1, dtype=torch.int64)
         for text, (mask, _) in truth.frames[view.stem].items():  # a later mask covers an earlier one

@@ -253,7 +253,7 @@ def evaluate(
     *,
     protocol: Word = "kfgs-pooled/1",
     truth: Given[Path] = None,
-    labels: Given[Literal["own", "nearest"]] = None,
+    labels: Given[Literal["own", "nearest", "paper"]] = None,
     out: Given[Path] = None,
     long: Flag = False,
     classes: Classes,
@@ -270,7 +270,7 @@ def evaluate(
         field: A run or field, or a folder of a teacher's maps; for kfgs-color a colour splat, or a run that has one.
         protocol: Its name, with or without version; a wrong name lists all.
         truth: Folder or file of the ground truth, if it is not in the scene; the teacher's maps for feature3dgs-teacher.
-        labels: Who says the class of a pixel: the field itself (own), or the nearest text, as for other programs' results.
+        labels: Who says the class of a pixel: the field itself (own), Sec. 3.4 (paper), or the nearest text, as for others.
         out: JSON file of scores, rows, options, command and machine.
         long: Say how it was measured, and print every row.
     """

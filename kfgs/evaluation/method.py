@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import Literal, NamedTuple, Protocol, get_args, runtime_checkable
 
 import torch
 from torch import Tensor
 
-from .._rows import EPS, row_norms, unit_embeddings, unit_rows
-from ..cameras import Camera
+from .._check import check_choice, check_shapes
+from .._rows import EPS, unit_embeddings
+from ..cameras import Camera, resize_map
 from ..fields import SemanticField
 from ..gaussians import Gaussians
 from ..scenes import FeatureFolder
 
-CHUNK = 8192  # pixels decoded at once
+LabelRule = Literal["own", "nearest", "paper"]
+CHANNELS = 64  # of a teacher's map, enlarged at once
 
 
 class View(NamedTuple):
@@ -110,20 +112,22 @@ class FieldMethod:
     """A `SemanticField` as a method: one level.
 
     The cosine of a pixel is that of the feature that is rendered there; of a field with an autoencoder, that of the
-    codeword with the nearest latent. Classes of pixels are those of `SemanticField.segment`, unless `own_labels` is False.
+    codeword with the nearest latent.
 
     Args:
         field: any field.
         name: for tables; None: "kfgs" and the name of the field's decoder.
-        own_labels: False takes the class with the largest cosine, as for the other methods.
+        rule: how a pixel gets its class. own: `SemanticField.segment`; paper: Sec. 3.4 as printed, `field.paper.segment` (decode,
+            quantise to S, look up the codeword's class); nearest: the text with the largest cosine, as for other methods.
     """
 
     levels = 1
 
-    def __init__(self, field: SemanticField, name: str | None = None, *, own_labels: bool = True) -> None:
-        self.field = field
+    def __init__(self, field: SemanticField, name: str | None = None, *, rule: LabelRule = "own") -> None:
+        check_choice("labels", rule, get_args(LabelRule))
+        self.field, self.rule = field, rule
+        self._asked = field.paper if rule == "paper" else field
         self.name = f"kfgs {field.decoder.name}" if name is None else name
-        self.own_labels = own_labels
 
     @property
     def gaussians(self) -> Gaussians:
@@ -141,8 +145,12 @@ class FieldMethod:
             return torch.where(labels < 0, unknown, unknown.scatter(2, labels.clamp_min(0), scores))[None]
 
     def labels(self, view: View, text: Tensor) -> Tensor:  # [K, D] -> [H, W] int64
-        """The class of each pixel: what `SemanticField.segment` says, or the largest cosine."""
-        return self.field.segment(view.camera, text) if self.own_labels else best_labels(self.cosines(view, text)[0])
+        """The class of each pixel by the method's rule."""
+        return (
+            best_labels(self.cosines(view, text)[0])
+            if self.rule == "nearest"
+            else self._asked.segment(view.camera, text)
+        )
 
     def gaussian_cosines(self, text: Tensor) -> Tensor:  # [K, D] -> [1, N, K]
         """The cosine of each Gaussian's fused feature with each text (`SemanticField.cosines`)."""
@@ -152,7 +160,7 @@ class FieldMethod:
 class TeacherMethod:
     """A teacher's maps as a method: one level and no Gaussians. Scores of it are what a field of these maps can reach.
 
-    A map of another size than the picture is resized bilinearly, a few rows at a time, before cosines are taken.
+    A map of another size than the picture is resized bilinearly, a few channels at a time, before cosines are taken.
 
     Args:
         maps: a `FeatureFolder`, or maps [h, w, D] by the stem of their picture. An all-zero feature means "unknown".
@@ -176,31 +184,18 @@ class TeacherMethod:
         features = maps[maps.stems.index(stem)] if isinstance(maps, FeatureFolder) else maps[stem]
         wide = torch.promote_types(features.dtype, torch.float32)  # half precision is computed in float32
         unit = unit_embeddings(text, "text").to(features.device, wide)
-        height, width = view.camera.size
-        upper, lower, down = _taps(height, int(features.shape[0]), self.align_corners)
-        left, right, across = _taps(width, int(features.shape[1]), self.align_corners)
-        down, across = down.to(unit)[:, None, None], across.to(unit)[:, None]
-        cosines = torch.empty(height, width, len(unit)).to(unit)
-        rows = max(1, CHUNK // width)
-        for start in range(0, height, rows):
-            part = slice(start, start + rows)
-            band = torch.lerp(features[upper[part]].to(wide), features[lower[part]].to(wide), down[part])
-            band = torch.lerp(band[:, left], band[:, right], across)
-            unknown = row_norms(band) <= EPS
-            cosines[part] = (unit_rows(band) @ unit.T).masked_fill(unknown[..., None], torch.nan)
-        return cosines[None]
+        check_shapes((f"the map of {stem!r}", features, ("h", "w", unit.shape[1])))
+        products, squares = (
+            torch.zeros(*view.camera.size, len(unit)).to(unit),
+            torch.zeros(*view.camera.size, 1).to(unit),
+        )
+        for some, rows in zip(features.split(CHANNELS, dim=2), unit.split(CHANNELS, dim=1), strict=True):
+            band = resize_map(some.to(wide), view.camera.size, align_corners=self.align_corners)
+            products += band @ rows.T
+            squares += band.square().sum(dim=2, keepdim=True)
+        lengths = squares.sqrt()
+        return (products / lengths.clamp_min(EPS)).masked_fill(lengths <= EPS, torch.nan)[None]
 
     def gaussian_cosines(self, text: Tensor) -> Tensor:
         """Raise a TypeError: a teacher has no Gaussians."""
         raise TypeError(f"method: expected one with Gaussians, got the teacher {self.name!r}; use a protocol of views")
-
-
-def _taps(size: int, source: int, align_corners: bool) -> tuple[Tensor, Tensor, Tensor]:
-    """For each of `size` places the two of `source` that are blended, and the share of the second."""
-    places = torch.arange(size, dtype=torch.float64)
-    if align_corners:
-        places = places * ((source - 1) / max(size - 1, 1))
-    else:
-        places = ((places + 0.5) * (source / size) - 0.5).clamp_min(0)
-    first = places.floor().long().clamp_max(source - 1)
-    return first, (first + 1).clamp_max(source - 1), places - first

@@ -20,7 +20,7 @@ from ..gaussians import Gaussians
 from ..scenes import Scene
 from .color import COLOR_PROTOCOL, score_views
 from .find import find_points
-from .method import Method, View, annotated, best_labels, check_level, label_view
+from .method import LabelRule, Method, View, annotated, best_labels, check_level, label_view
 from .report import Report, Row, make_report
 from .segmentation import PROTOCOL, evaluate_segmentation
 from .surface import ABOUT, NAME, score_surface
@@ -36,8 +36,8 @@ class KfgsPooled:
 
     name: ClassVar[str] = "kfgs-pooled/1"
     about: ClassVar[str] = PROTOCOL.partition(": ")[2]
-    own_labels: ClassVar[bool] = True
-    """A field says the class of a pixel by its own rule, not by the largest cosine."""
+    rule: ClassVar[LabelRule] = "own"
+    """How a field of kfgs decides the class of a pixel (`FieldMethod`)."""
     open = staticmethod(label_views)
 
     level: int = 0

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from ..scenes.files import natural_key
-from .method import Method, View, label_view
+from .method import LabelRule, Method, View, label_view
 from .report import Report, Row, make_report, mean
 from .texts import Encode, encode_unit
 
@@ -65,7 +65,7 @@ class TeacherAgreement:
         "classes of both; mean over the views; no ground truth"
     )
 
-    own_labels: ClassVar[bool] = False
+    rule: ClassVar[LabelRule] = "nearest"
     """Every method takes the text with the largest cosine."""
 
     texts: tuple[str, ...] | None = None

@@ -9,14 +9,14 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 
 from .._card import short_repr
 from .._files import as_path, file_stem
 from ..evaluation import FieldMethod, Method, Report, TeacherMethod, View
-from ..evaluation.method import Labeller
+from ..evaluation.method import Labeller, LabelRule
 from ..evaluation.protocols import get_protocol
 from ..evaluation.teacher_agreement import TeacherAgreement
 from ..evaluation.texts import Encode, as_encoder
@@ -30,7 +30,6 @@ from ..scenes import FeatureFolder, Scene, load_scene
 from .maps import maps_of_views
 
 MAPS = ("features.json", "*_fmap_CxHxW.pt", "*.npy")  # files in a folder of feature maps
-LabelRule = Literal["own", "nearest"]
 
 
 class Question(NamedTuple):
@@ -99,8 +98,7 @@ def evaluate(
         question: from `open_question`; several results can be asked the same.
         encode: a label set, or the teacher's text encoder. Not needed for colours. `feature3dgs-teacher/1` asks the classes of
             a label set, and LSeg's words of a text encoder.
-        labels: how a field of kfgs decides the class of a pixel: `own` is `SemanticField.segment`; `nearest` is the text with
-            the largest cosine, as for other methods. None: `own` in kfgs's protocols, `nearest` in those of others.
+        labels: who decides the class of a field's pixel (`rule` of `FieldMethod`). None: own in kfgs's protocols, else nearest.
         command: kept in the report.
 
     Raises:
@@ -111,7 +109,7 @@ def evaluate(
     if not isinstance(question, Question):
         got = type(question).__name__
         raise TypeError(f"question: expected a Question, got {got}; call open_question(scene, protocol)")
-    scorer, rule = question.protocol, getattr(question.protocol, "own_labels", None)
+    scorer, rule = question.protocol, getattr(question.protocol, "rule", None)
     if labels is not None and rule is None:
         raise ValueError(f"labels: expected none with {scorer.name}, which takes no class per pixel, got {labels!r}")
     method: Any = open_result(field, question) if isinstance(field, str | Path) else field
@@ -123,14 +121,14 @@ def evaluate(
         report: Report = scorer.score(method.replace(sh=method.sh.to(torch.float32)), question.truth)
     else:
         if isinstance(method, FieldMethod) and rule is not None and (labels is not None or method is not field):
-            method = FieldMethod(method.field, method.name, own_labels=rule if labels is None else labels == "own")
+            method = FieldMethod(method.field, method.name, rule=labels or rule)
         if isinstance(scorer, TeacherAgreement) and isinstance(encode, LabelSet) and scorer.texts is None:
             scorer = replace(scorer, texts=encode.names)
         report = scorer.score(method, question.truth, list(question.views), as_encoder(encode))
     if rule is not None and isinstance(method, Labeller):
-        own = getattr(method, "own_labels", True)
-        changed = (*report.changed, "labels") if own != rule else report.changed
-        report = replace(report, options={**report.options, "labels": "own" if own else "nearest"}, changed=changed)
+        used = getattr(method, "rule", "own")
+        unusual = ("labels",) if used != rule else ()
+        report = replace(report, options={**report.options, "labels": used}, changed=(*report.changed, *unusual))
     notes = (*report.notes, *_notes(question.scored, method, encode))
     return replace(report, notes=notes, command=command, machine=this_machine())
 

@@ -55,7 +55,9 @@ def test_a_field_answers_with_the_cosines_of_what_is_seen(mode):
 def test_a_field_labels_pixels_as_segment_does(mode):
     field = _field(mode)
     assert torch.equal(label_view(FieldMethod(field), VIEW, ROWS), field.segment(VIEW.camera, ROWS))
-    plain = FieldMethod(field, "x", own_labels=False)
+    printed = field.paper.segment(VIEW.camera, ROWS)
+    assert torch.equal(label_view(FieldMethod(field, rule="paper"), VIEW, ROWS), printed)
+    plain = FieldMethod(field, "x", rule="nearest")
     assert torch.equal(label_view(plain, VIEW, ROWS), best_labels(plain.cosines(VIEW, ROWS)[0]))
     assert plain.name == "x"
     refused(lambda: label_view(plain, VIEW, ROWS, 1), "level: expected 0 to 0", "levels of 'x'", "got 1")

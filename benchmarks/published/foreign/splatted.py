@@ -11,7 +11,8 @@ from torch import Tensor
 
 from kfgs._check import check_shapes
 from kfgs._rows import EPS, row_norms, unit_embeddings, unit_rows
-from kfgs.evaluation.method import CHUNK, View
+from kfgs.evaluation.method import View
+from kfgs.fields.decoders import CHUNK
 from kfgs.gaussians import Gaussians
 from kfgs.splat import rasterize
 
