@@ -1,10 +1,24 @@
-"""Autoencoders with given weights, for tests."""
+"""Autoencoders with given weights, and maps that count what is read, for tests."""
 
 from __future__ import annotations
 
 import torch
 
 from kfgs.quant import Autoencoder
+
+
+class Lazy:
+    """Notes what is read, and has nothing of a sequence but length and item."""
+
+    def __init__(self, maps):
+        self.maps, self.reads = maps, []
+
+    def __len__(self):
+        return len(self.maps)
+
+    def __getitem__(self, i):
+        self.reads.append(i)
+        return self.maps[i]
 
 
 def made_autoencoder(encoder, decoder, low=0.0, high=1.0) -> Autoencoder:

@@ -18,7 +18,7 @@ AIM = {  # lines of Python with docstrings (DESIGN, section 2); "base": the file
 }  # fmt: skip
 NOT_YET = {  # what is above its aim: a change may lower these numbers, and never raises them
     "fields": 2_653, "labels": 2_024,
-    "quant": 1_255, "base": 1_250,
+    "quant": 1_254, "base": 1_250,
 }  # fmt: skip
 SCRIPTS = 4_000  # lines of the viewer's JavaScript
 TESTS = 33_300  # lines of Python in tests/: whoever lowers it brings it nearer to 32_000, and nobody raises it

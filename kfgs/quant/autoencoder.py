@@ -202,7 +202,7 @@ def fit_autoencoder(
     with quick_on_a_cpu():
         for step in tqdm(range(1, config.steps + 1), desc="autoencoder", disable=progress is not True):
             latents = _normalised_latents(made, norms, target)
-            low, high = latents.detach().amin(), latents.detach().amax()
+            low, high = latents.detach().aminmax()
             rows, wanted = (latents - low) / (high - low).clamp_min(SMALLEST), target
             if config.blends:
                 shares = _blends(config.blends, K, generator, target)
@@ -220,10 +220,8 @@ def fit_autoencoder(
                     progress(dict(history[-1]))
     made.requires_grad_(False)
     with torch.no_grad():
-        latents = _normalised_latents(made, norms, target, freeze=True)
-        least = float(latents.min())
-        ends = [least, max(float(latents.max()), least + SMALLEST)]
-        made.range = torch.tensor(ends, dtype=torch.float64, device=target.device)
+        low, high = _normalised_latents(made, norms, target, freeze=True).double().aminmax()
+        made.range = torch.stack([low, torch.maximum(high, low + SMALLEST)])
         decoded = made.decode(made.encode(codebook.codewords))
         recovered = codebook.quantize(decoded) == torch.arange(K, device=decoded.device)
         loss = row_norms(decoded - codebook.unit).mean()

@@ -72,6 +72,7 @@ def fit_codebook(
     maps: FeatureMaps,  # each [h, w, D]
     options: GrownCodebook | PaperCodebook | None = None,
     *,
+    device: torch.device | str | None = None,
     generator: torch.Generator | None = None,
     progress: Progress = False,
 ) -> Codebook:
@@ -81,6 +82,7 @@ def fit_codebook(
         maps: one map per image, read one at a time. Sizes may differ, D may not. All-zero features are left out; half
             precision is computed in float32.
         options: `GrownCodebook` (also if None), kfgs's own, reads each map once; `PaperCodebook` (Eq. 5-9) once per epoch.
+        device: computes, and has the codebook; None: that of the maps. Maps are moved one at a time.
         generator: draws the first directions of splits, or the order of the images; None: seed 0. On a CPU the same state
             gives the same bits.
         progress: True shows a bar; a function is called with each record as it is written to the history.
@@ -98,7 +100,7 @@ def fit_codebook(
     channels: list[int] = []
 
     def read(i: int) -> Tensor:  # [n, D] nonzero, in at least single precision
-        features = read_grid(maps, i, samples)
+        features = read_grid(maps, i, samples).to(device)
         channels.append(features.shape[-1])
         check_shapes((f"maps[{i}]", features, ("n", channels[0])))
         # row by row, whatever memory they come in: sums over another layout differ in their last bits

@@ -142,6 +142,8 @@ def quantize_maps(
 ) -> IndexMaps:
     """Replace every pixel's feature by the number of its most similar codeword (Eq. 5), with one map in memory at a time.
 
+    A map is computed on the codebook's device; the result is NumPy's.
+
     An all-zero feature (not longer than `EPS`, as in `fit_codebook`) says nothing about its pixel and becomes a hole, K.
 
     Raises:
@@ -149,7 +151,7 @@ def quantize_maps(
     """
     indices = []
     for i in tqdm(range(len(maps)), desc="quantise", disable=not as_bar(progress)):
-        feature_map = as_tensor(f"maps[{i}]", maps[i])
+        feature_map = as_tensor(f"maps[{i}]", maps[i]).to(codebook.codewords.device)
         check_shapes((f"maps[{i}]", feature_map, ("h", "w", codebook.dim)))
         index, _, length = codebook.compare(feature_map)
         check_directions(f"maps[{i}]", feature_map, length, ENCODE)

@@ -29,8 +29,7 @@ class PaperCodebook:
     is due, and drop codewords that are too similar (Eq. 9). Codewords that stay keep Adam's moments, and their gradients
     gathered since the last step.
 
-    The result depends on the unit of the features, because codewords keep their length while `learning_rate` does not:
-    features and rate times 10 give codewords times 10, features alone do not.
+    The result depends on the unit of the features: those times 10 give codewords times 10 only with 10 times the rate.
     """
 
     maximum: int = 100
@@ -78,7 +77,7 @@ class PaperCodebook:
         history: list[dict[str, Any]] = []
         bar = tqdm(range(self.epochs), desc="codebook", disable=progress is not True)
         for epoch in bar:
-            before, pruned, visits = len(book.rows), 0, list[tuple[float, Tensor]]()
+            size, pruned, visits = len(book.rows), 0, list[tuple[float, Tensor]]()
             period = 1 if epoch < self.eager_epochs else self.step_every
             order = torch.randperm(maps, generator=generator, device=generator.device).tolist()
             for seen, i in enumerate(order, start=1):
@@ -88,11 +87,11 @@ class PaperCodebook:
                 if seen % period == 0 or seen == maps:
                     book.step()
                 pruned += book.prune()
-            size, (losses, similarities) = len(book.rows), zip(*visits, strict=True)
-            record: dict[str, Any] = {"epoch": epoch, "size": size, "added": size - before + pruned, "pruned": pruned}
-            record |= {"loss": sum(losses) / len(losses)} | coverage(torch.cat(similarities), self.expand_below)
-            history.append(record)
-            bar.set_postfix(K=size, coverage=f"{record['coverage']:.3f}")
+            losses, similarities = zip(*visits, strict=True)
+            counts = {"size": len(book.rows), "added": len(book.rows) - size + pruned, "pruned": pruned}
+            reached = {"loss": sum(losses) / len(losses)} | coverage(torch.cat(similarities), self.expand_below)
+            history.append({"epoch": epoch, **counts, **reached})
+            bar.set_postfix(K=counts["size"], coverage=f"{reached['coverage']:.3f}")
             if callable(progress):
                 progress(dict(history[-1]))
         codebook = Codebook(book.rows)
@@ -186,11 +185,9 @@ class EvolvingCodebook:
 
     def prune(self) -> int:
         """Drop codewords that are too similar (Eq. 9); their number."""
-        stays = prune(self.rows, threshold=self.options.prune_above)
-        dropped = len(self.rows) - len(stays)
-        if dropped:
-            self.state = {name: value[stays] for name, value in self.state.items()}
-        return dropped
+        size, stays = len(self.rows), prune(self.rows, threshold=self.options.prune_above)
+        self.state = {name: value[stays] for name, value in self.state.items()}
+        return size - len(stays)
 
 
 def _fresh(rows: Tensor) -> dict[str, Tensor]:

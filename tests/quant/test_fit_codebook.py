@@ -1,46 +1,17 @@
 import math
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import oracles_quant as oracle
 import pytest
 import torch
+from cases_quant import Lazy
 from messages import refused
 
 import kfgs
 from kfgs.quant import GrownCodebook, PaperCodebook, fit_codebook, grow, sample_grid
-
-
-class Lazy:
-    """Length and item only; the most maps alive at a time would show in `reads` of one pass."""
-
-    def __init__(self, maps):
-        self.maps, self.reads = maps, []
-
-    def __len__(self):
-        return len(self.maps)
-
-    def __getitem__(self, i):
-        self.reads.append(i)
-        return self.maps[i].clone()
-
-
-class OnDisk:
-    """Maps that give their grids alone, as those on disk do: to ask for a whole map is an error."""
-
-    def __init__(self, maps):
-        self.maps, self.asked = maps, []
-
-    def __len__(self):
-        return len(self.maps)
-
-    def __getitem__(self, i):
-        raise AssertionError(f"the whole of map {i} was read")
-
-    def grid(self, i, samples):
-        self.asked.append((i, samples))
-        return sample_grid(self.maps[i], samples=samples)
 
 
 def scene(classes=6, images=5, size=(9, 12), dim=24, noise=0.05, seed=0):
@@ -57,19 +28,35 @@ def scene(classes=6, images=5, size=(9, 12), dim=24, noise=0.05, seed=0):
     return maps, labels, centres
 
 
-@pytest.mark.parametrize(("joins", "noise"), [(None, 0.01), (4, 0.05)])
-def test_finds_the_classes_of_a_clean_scene_though_the_first_image_lacks_some(joins, noise):
-    """As printed, all new features join at once: those of a class become one codeword only where they are above beta."""
-    maps, labels, centres = scene(noise=noise)
-    fit = fit_codebook(maps, PaperCodebook(initial=2, epochs=6, joins_per_image=joins))
-    assert fit.size == 6
-    assert fit.report.coverage == 1.0
-    assert fit.report.history[0]["added"] - fit.report.history[0]["pruned"] == 4
+@pytest.mark.parametrize(
+    ("options", "noise"),
+    [
+        (
+            PaperCodebook(initial=2, epochs=6),
+            0.01,
+        ),  # all new features join at once, and are one where they are above beta
+        (PaperCodebook(initial=2, epochs=6, joins_per_image=4), 0.05),
+        (None, 0.05),
+    ],
+)
+def test_finds_the_classes_of_a_clean_scene_though_the_first_image_lacks_some(options, noise):
+    maps, labels, centres = scene(size=(48, 60) if options is None else (9, 12), noise=noise)
+    records = []
+    fit = fit_codebook(maps, options, progress=records.append)
+    assert records == fit.report.history
+    assert fit.size == records[-1]["size"] == 6
     name = fit.quantize(centres)  # codeword of each class
     assert sorted(name.tolist()) == list(range(6))
     for feature_map, label in zip(maps, labels, strict=True):
         assert torch.equal(fit.quantize(feature_map), name[label])
     assert fit.report.usage.tolist() == [sum(int((name[lab] == e).sum()) for lab in labels) for e in range(6)]
+    assert fit.report.coverage == pytest.approx(0.9 if options is None else 1, abs=0.01)
+    similarity = torch.cat([fit.nearest(m).similarity.flatten() for m in maps])
+    assert fit.report.mean_similarity == pytest.approx(similarity.double().mean().item())
+    if options is None:
+        torch.testing.assert_close(fit.codewords.square().mean(dim=1).sqrt(), torch.full((6,), 0.5))
+    else:
+        assert records[0]["added"] - records[0]["pruned"] == 4
 
 
 @pytest.mark.parametrize("joins", [None, 1])
@@ -106,17 +93,6 @@ def test_same_generator_state_same_bits_and_order_is_random():
     first, one, two, final = [0], runs[0][2][1:6], runs[0][2][6:11], runs[0][2][11:]
     assert (first, sorted(one), sorted(two), final) == ([0], list(range(5)), list(range(5)), list(range(5)))
     assert one != two
-
-
-@pytest.mark.parametrize("step_every", [1, 8])
-def test_never_more_than_the_maximum(step_every):
-    maps, *_ = scene(classes=12, noise=1.0)
-    sizes = []
-    config = PaperCodebook(initial=4, maximum=9, epochs=3, eager_epochs=1, step_every=step_every)
-    fit = fit_codebook(maps, config, progress=lambda record: sizes.append(record["size"]))
-    assert sizes == [record["size"] for record in fit.report.history]
-    assert max(sizes) == 9
-    assert fit.report.coverage < 1
 
 
 def test_zero_features_are_left_out():
@@ -175,59 +151,48 @@ def test_bad_config(values, message):
     refused(lambda: PaperCodebook(**values), *message)
 
 
-@pytest.mark.parametrize(("joins", "each"), [(None, [0, 0, 0, 8]), (2, [2, 2, 2, 2])])
-def test_one_image_may_fill_the_codebook_unless_the_room_is_shared(joins, each):
-    generator = torch.Generator().manual_seed(5)
-    maps = [torch.randn(8, 8, 32, generator=generator) for _ in range(4)]  # nothing is similar to anything
-    limits = dict(initial=2, maximum=10, joins_per_image=joins)
-    book = fit_codebook(maps, PaperCodebook(**limits, epochs=1, learning_rate=1e-6))
-    assert book.report.history[0]["added"] == 8
-    copied = [int((book.similarity(m).flatten(0, 1).amax(dim=0)[2:] > 0.999).sum()) for m in maps]
-    assert sorted(copied) == each
-
-
-def test_default_finds_the_classes_and_says_what_it_reached():
-    maps, labels, centres = scene(size=(48, 60))
-    records = []
-    fit = fit_codebook(maps, progress=records.append)
-    assert fit.size == 6
-    assert records == fit.report.history
-    name = fit.quantize(centres)
-    assert sorted(name.tolist()) == list(range(6))
-    for feature_map, label in zip(maps, labels, strict=True):
-        assert torch.equal(fit.quantize(feature_map), name[label])
-    similarity = torch.cat([fit.nearest(m).similarity.flatten() for m in maps])
-    assert fit.report.coverage == pytest.approx(0.9, abs=0.01)
-    assert fit.report.mean_similarity == pytest.approx(similarity.double().mean().item())
-    assert fit.report.usage.tolist() == [sum(int((name[lab] == e).sum()) for lab in labels) for e in range(6)]
-    torch.testing.assert_close(fit.codewords.square().mean(dim=1).sqrt(), torch.full((6,), 0.5))
-
-
-@pytest.mark.parametrize("each", [False, True])
-def test_lengths_of_features_do_not_matter(each):
-    """Powers of two, so that not even rounding differs; each feature has its own, or all have the same."""
+def test_lengths_of_features_do_not_matter_to_kfgs_own():
+    """Powers of two, so that not even rounding differs: a length for each feature. And the unit of all, times 0.1 and 10."""
     maps, *_ = scene(noise=0.4, size=(24, 33))
     generator = torch.Generator().manual_seed(7)
-    power = [torch.randint(-6, 7, (24, 33, 1), generator=generator) if each else torch.tensor(9) for _ in maps]
-    scaled = [torch.ldexp(m, p) for m, p in zip(maps, power, strict=True)]
-    one, other = fit_codebook(maps), fit_codebook(scaled)
-    assert torch.equal(one.codewords, other.codewords)
-    assert torch.equal(one.report.usage, other.report.usage)
-    assert (one.report.coverage, one.report.history) == (other.report.coverage, other.report.history)
-    rough = fit_codebook([m * 0.37 for m in maps])
-    assert rough.size == one.size
-    torch.testing.assert_close(rough.codewords, one.codewords, rtol=1e-3, atol=1e-4)
+    book = fit_codebook(maps)
+    scaled = [torch.ldexp(m, torch.randint(-6, 7, (24, 33, 1), generator=generator)) for m in maps]
+    other = fit_codebook(scaled)
+    assert torch.equal(book.codewords, other.codewords)
+    assert torch.equal(book.report.usage, other.report.usage)
+    assert (book.report.coverage, book.report.history) == (other.report.coverage, other.report.history)
+    for unit in (0.1, 10):
+        other = fit_codebook([unit * m for m in maps])
+        assert other.size == book.size
+        torch.testing.assert_close(other.codewords, book.codewords, rtol=1e-3, atol=1e-4)
 
 
-def test_many_maps_share_the_pool(monkeypatch):
+@pytest.mark.parametrize("unit", [0.1, 10])
+def test_the_papers_rate_has_the_unit_of_the_features(unit):
+    maps = [m.double() for m in scene(noise=0.4)[0]]
+    config = PaperCodebook(initial=3, maximum=12, epochs=3, learning_rate=0.02)
+    book = fit_codebook(maps, config)
+    scaled = [unit * m for m in maps]
+    same = fit_codebook(scaled, replace(config, learning_rate=unit * 0.02))
+    torch.testing.assert_close(
+        same.codewords, unit * book.codewords, rtol=1e-3, atol=0
+    )  # Adam's epsilon has a unit too
+    assert not torch.allclose(fit_codebook(scaled, config).unit, book.unit, atol=1e-2)
+
+
+def test_many_maps_share_the_pool_and_give_their_grids_alone(monkeypatch):
     """100 features of 5 maps of 12 x 15: 20 each at most, which are those of rows and columns 1::3."""
+
+    class Grids:  # to ask for a whole map is a TypeError
+        def __len__(self):
+            return len(maps)
+
+        def grid(self, i, samples):
+            return sample_grid(maps[i], samples=samples)
+
     monkeypatch.setattr(grow, "POOL", 100)
     maps, *_ = scene(size=(12, 15))
-    disk = OnDisk(maps)
-    fit = fit_codebook(disk)
-    assert [samples for _, samples in disk.asked] == [20] * 5
-    assert int(fit.report.usage.sum()) == 5 * 20
-    assert (
-        fit.report.usage.tolist()
-        == sum(torch.bincount(fit.quantize(m[1::3, 1::3]).flatten(), minlength=fit.size) for m in maps).tolist()
-    )
+    fit = fit_codebook(Grids())
+    usage = sum(torch.bincount(fit.quantize(m[1::3, 1::3]).flatten(), minlength=fit.size) for m in maps)
+    assert int(usage.sum()) == 5 * 20
+    assert fit.report.usage.tolist() == usage.tolist()

@@ -1,24 +1,11 @@
 import numpy as np
 import pytest
 import torch
+from cases_quant import Lazy
 from messages import refused, tells
 
 from kfgs.quant import Codebook, LatentMaps, quantize_maps, sample_grid
 from kfgs.quant.maps import IndexMaps, grid_slices
-
-
-class Lazy:
-    """Counts what is read, and has nothing of a sequence but length and item."""
-
-    def __init__(self, maps):
-        self.maps, self.reads = maps, 0
-
-    def __len__(self):
-        return len(self.maps)
-
-    def __getitem__(self, i):
-        self.reads += 1
-        return self.maps[i]
 
 
 def test_quantize_maps_reads_each_map_once_and_sizes_may_differ():
@@ -26,7 +13,7 @@ def test_quantize_maps_reads_each_map_once_and_sizes_may_differ():
     maps = Lazy([torch.randn(h, w, 4, generator=generator) for h, w in ((3, 5), (2, 7))])
     book = Codebook(torch.randn(6, 4, generator=generator))
     index_maps = quantize_maps(maps, book)
-    assert maps.reads == len(index_maps) == 2
+    assert maps.reads == [0, 1]
     for found, feature_map in zip(index_maps, maps.maps, strict=True):
         assert found.dtype == np.uint8
         assert np.array_equal(found, book.quantize(feature_map).numpy())
