@@ -3,8 +3,6 @@
 import ast
 import importlib
 import json
-import re
-import runpy
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -34,10 +32,6 @@ def start(monkeypatch, name, *words):
     return importlib.import_module(name)
 
 
-def rows_of(said):
-    return [line.split(" | ") for line in said.splitlines() if line.startswith("| ")][1:]
-
-
 def test_engines_are_measured_side_by_side(monkeypatch, tmp_path):
     """On 200 Gaussians in a picture of 32 x 24."""
     engines = start(monkeypatch, "engines")
@@ -56,19 +50,3 @@ def test_engines_are_measured_side_by_side(monkeypatch, tmp_path):
     assert all(0 < each["least"] <= each["median"] for each in times + list(step["step"].values()))
     assert max(timed["difference"].values()) < 1e-2
     assert 0 < timed["pairs"]["visible"] <= timed["pairs"]["listed"] <= 4 * timed["pairs"]["visible"]  # of four tiles
-
-
-def test_old_and_new_label_maps_are_equal(monkeypatch, capsys):
-    start(monkeypatch, "labels", "--quick").main()
-    rows = rows_of(capsys.readouterr().out)
-    assert len(rows) == 6
-    assert [row[-1] for row in rows if "query" not in row[0]] == ["yes |"] * 5
-
-
-def test_transfer_prints_every_row(monkeypatch, capsys):
-    options = ["--sources", "4000", "--destinations", "5000", "--repeats", "1"]
-    monkeypatch.setattr("sys.argv", ["transfer.py", *options])
-    runpy.run_path(str(BENCHMARKS / "transfer.py"), run_name="__main__")
-    rows = dict(re.findall(r"^(.*?) {2,}\d.* ([\d.]+)%$", capsys.readouterr().out, re.MULTILINE))
-    assert set(rows) == {"nearest, lambda chosen", "nearest"}
-    assert all(95 < float(share) <= 100 for share in rows.values())  # lambda covers 99.5 % of the destinations
