@@ -9,6 +9,10 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import torch
+from kornia.geometry.liegroup import Se3, So3
+from kornia.geometry.quaternion import Quaternion
+from kornia.image import ImageSize
+from kornia.sensors.camera import CameraModel, CameraModelType
 from torch import Tensor
 
 from .._card import cut
@@ -20,8 +24,7 @@ DistortionModel = Literal["brown_conrady", "kannala_brandt"]
 COEFFICIENTS = {"brown_conrady": (4, 5, 8), "kannala_brandt": (4,)}
 
 ROTATION_TOLERANCE = 1e-3  # of R R^T: matrices from text files have few digits
-NEAR = 0.2
-"""World units: the smallest depth that 3DGS draws, meant for scenes of metres."""
+NEAR = 0.2  # world units: the smallest depth that 3DGS draws, meant for scenes of metres
 UP = (0.0, 0.0, 1.0)  # in the world, by default
 _names = functools.lru_cache(8)(functools.partial(Names, bare=True))  # of views: many are looked up one after the other
 
@@ -66,15 +69,21 @@ class Camera:
     R = property(lambda self: self.viewmat[:3, :3], doc="The rotation from world to camera [3, 3].")
     t = property(lambda self: self.viewmat[:3, 3], doc="The translation from world to camera [3]: x_camera = R x + t.")
     c2w = property(lambda self: torch.linalg.inv(self.viewmat), doc="Camera to world [4, 4], the inverse of `viewmat`.")
+    center = property(lambda self: -self.R.T @ self.t, doc="The camera's position [3], counted from `origin`.")
     fx = property(lambda self: float(self.K[0, 0]), doc="The horizontal focal length, pixels.")
     fy = property(lambda self: float(self.K[1, 1]), doc="The vertical focal length, pixels.")
     cx = property(lambda self: float(self.K[0, 2]), doc="The principal point, pixels from the left edge.")
     cy = property(lambda self: float(self.K[1, 2]), doc="The principal point, pixels from the upper edge.")
-    cameras = property(lambda self: (self,), doc="The camera alone, so that it can stand for a list of cameras.")
+    intrinsics_at_integer_centers = property(
+        lambda self: self.K - self.K.new_tensor([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]),
+        doc="K [3, 3] for functions that put the centre of the first pixel at (0, 0), as kornia's grids do: cx, cy less 0.5.",
+    )
+    model = property(lambda self: kornia_model(self.K, self.distortion, self.size), doc="Kornia's `CameraModel`.")
+    pose = property(lambda self: Se3.from_matrix(self.viewmat.clone()), doc="The viewmat as kornia's `Se3`.")
 
     def __post_init__(self) -> None:
         for name in ("viewmat", "K"):  # integers would truncate the points
-            object.__setattr__(self, name, as_tensor(name, getattr(self, name), floating=True))
+            object.__setattr__(self, name, as_tensor(name, as_matrix(getattr(self, name)), floating=True))
         check_shapes(("viewmat", self.viewmat, "4 4"), ("K", self.K, "3 3"))
         object.__setattr__(self, "origin", as_origin(self.origin))
         for name, size in (("width", self.width), ("height", self.height)):
@@ -147,16 +156,6 @@ class Camera:
         """(height, width) in pixels."""
         return self.height, self.width
 
-    @property
-    def center(self) -> Tensor:  # [3]
-        """The camera's position, counted from `origin`."""
-        return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
-
-    @property
-    def intrinsics_at_integer_centers(self) -> Tensor:  # [3, 3]
-        """K for functions that put the centre of the first pixel at (0, 0), as kornia's grids do: cx, cy less 0.5."""
-        return self.K - self.K.new_tensor([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
-
     def resized(self, height: int, width: int) -> Camera:
         """The same view with another number of pixels; the two axes scale independently (kornia's `scale` does not).
 
@@ -191,11 +190,24 @@ class Camera:
         return replace(self, viewmat=self.viewmat.to(*args, **kwargs), K=self.K.to(*args, **kwargs))
 
 
-def exact_rotation(name: str, matrix: Tensor) -> Tensor:  # [3, 3] -> [3, 3] float64
-    """The exact rotation nearest to a rounded one.
+def kornia_model(K: Tensor, distortion: Distortion | None, size: tuple[int, int]) -> CameraModel:
+    """Kornia's model of a projection through a lens: fx, fy, cx, cy and the coefficients, zero where there are fewer."""
+    params, kind = K[[0, 1, 0, 1], [0, 1, 2, 2]], CameraModelType.PINHOLE
+    if distortion is not None:
+        brown = distortion.model == "brown_conrady"
+        kind = CameraModelType.BROWN_CONRADY if brown else CameraModelType.KANNALA_BRANDT_K3
+        params = torch.cat([params, K.new_tensor((*distortion.coefficients, *[0.0] * 4)[: 8 if brown else 4])])
+    return CameraModel(ImageSize(*size), kind, params)
 
-    A ValueError, which names the argument `name`, if it is not finite, not orthonormal to 1e-3, or a reflection.
-    """
+
+def as_matrix(value: Any) -> Any:
+    """The matrix of kornia's `Se3`, `So3`, `Quaternion` or `NamedPose`, also of a batch of one; anything else as it is."""
+    value = getattr(value, "pose", value)  # of a NamedPose
+    return value.matrix().squeeze(0) if isinstance(value, Se3 | So3 | Quaternion) else value
+
+
+def exact_rotation(name: str, matrix: Tensor) -> Tensor:  # [3, 3] -> [3, 3] float64
+    """The exact rotation nearest to a rounded one; a ValueError about `name` if it is not orthonormal to 1e-3, or mirrors."""
     M = matrix.detach().double().cpu()
     error = (M @ M.T - torch.eye(3, dtype=torch.float64)).abs().max()
     if not error <= ROTATION_TOLERANCE:  # NaN fails every comparison

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import compress
 from math import cos, hypot, pi, radians, sin, tan
 from typing import NamedTuple
 
 import numpy as np
 import torch
+from kornia.geometry.conversions import Rt_to_matrix4x4
 from scipy.spatial.transform import Rotation, RotationSpline
 from torch import Tensor
 
@@ -17,6 +19,7 @@ from .._card import short_repr
 from .._check import ORIGIN, as_array, as_origin, as_tensor, check_range, check_shapes, check_size, check_whole
 from .._rows import check_finite
 from .camera import UP, Camera, unit_vector
+from .projection import as_cameras
 from .resample import fits_aspect
 
 SAME = 1e-9  # successive views closer than this, in position and direction, are the same view
@@ -47,38 +50,29 @@ def path_cameras(
 
     check_whole("frames", frames, 2)
     check_whole("every", every, 1)
-    cameras = getattr(cameras, "cameras", cameras)
-    cameras = [camera.with_origin(cameras[0].origin) for camera in cameras]
-    keys = [*cameras[::every], *([cameras[-1]] if cameras and (len(cameras) - 1) % every else [])]
-    if len(keys) > 1:
-        moved = _durations(*_poses(keys)) > SAME
-        keys = [keys[0], *(key for key, new in zip(keys[1:], moved, strict=True) if new)]
+    views = as_cameras(cameras, advice := "pass the cameras of the scene in the order of the path")
+    views = [view.with_origin(views[0].origin).to(torch.float64) for view in views]
+    keys = [*views[::every], *([views[-1]] if (len(views) - 1) % every else [])]
+    centers, turns = (np.stack([as_array(getattr(key, name)) for key in keys]) for name in ("center", "R"))
+    rotations = Rotation.from_matrix(turns)
+    new = np.array([True, *(_durations(centers, rotations) > SAME)])
+    keys, centers, rotations = list(compress(keys, new)), centers[new], rotations[new]
     if len(keys) < 2:
-        raise ValueError(
-            f"cameras: expected at least two different views, got {len(keys)} (of {len(cameras)}, every {every}); pass the "
-            "cameras of the scene in the order of the path"
-        )
-    first = cameras[0].size
+        got = f"{len(keys)} (of {len(views)}, every {every}); {advice}"
+        raise ValueError(f"cameras: expected at least two different views, got {got}")
+    first = views[0].size
     check_size(size := size or first)
     keys = [(key if fits_aspect(key.size, first) else key.letterboxed(*first)).resized(*size) for key in keys]
-    centers, rotations = _poses(keys)
     key_times = np.concatenate([[0.0], np.cumsum(_durations(centers, rotations))])
     times = np.linspace(0, key_times[-1], frames)
     R = RotationSpline(key_times, rotations)(times).as_matrix()  # [frames, 3, 3] world to camera
-    t = -np.einsum("nij,nj->ni", R, CubicSpline(key_times, centers)(times))  # t = -R c
-    key_Ks = np.stack([as_array(key.K).astype(np.float64).reshape(9) for key in keys], axis=1)  # [9, k]
+    t = -R @ CubicSpline(key_times, centers)(times)[..., None]  # t = -R c
+    viewmats = Rt_to_matrix4x4(torch.from_numpy(R), torch.from_numpy(t))
+    key_Ks = np.stack([as_array(key.K).reshape(9) for key in keys], axis=1)  # [9, k]
     Ks = np.stack([np.interp(times, key_times, row) for row in key_Ks], axis=1).reshape(-1, 3, 3)
-    near, origin = min(camera.near for camera in cameras), cameras[0].origin
-    viewmats = np.tile(np.eye(4), (frames, 1, 1))
-    viewmats[:, :3, :3], viewmats[:, :3, 3] = R, t
-    pairs = enumerate(zip(torch.from_numpy(viewmats), torch.from_numpy(Ks), strict=True))
+    near, origin = min(view.near for view in views), views[0].origin
+    pairs = enumerate(zip(viewmats, torch.from_numpy(Ks), strict=True))
     return [Camera(*pair, size[1], size[0], f"path_{i:04d}", near=near, origin=origin) for i, pair in pairs]
-
-
-def _poses(keys: Sequence[Camera]) -> tuple[Array, Rotation]:  # [k, 3], k rotations from world to camera
-    viewmats = np.stack([as_array(key.viewmat).astype(np.float64) for key in keys])
-    R, t = viewmats[:, :3, :3], viewmats[:, :3, 3]
-    return -np.einsum("nji,nj->ni", R, t), Rotation.from_matrix(R)  # c = -R^T t
 
 
 def _durations(centers: Array, rotations: Rotation) -> Array:  # [k - 1]
@@ -153,9 +147,8 @@ def camera_extent(cameras: Sequence[Camera], points: Tensor) -> float:  # [P, 3]
 
     If all cameras stand in one place, it is the median distance to the points, or 1 without points.
     """
-    if len(cameras) == 0:
-        raise ValueError("cameras: expected at least one view, got none; the extent of an empty scene is unknown")
-    centers = torch.stack([camera.center.detach().double().cpu() for camera in cameras])
+    views = as_cameras(cameras, "the extent of an empty scene is unknown")
+    centers = torch.stack([view.center.detach().double().cpu() for view in views])
     mean = centers.mean(0)
     radius = 1.1 * float((centers - mean).norm(dim=-1).max())
     if radius > 1e-6 * (1 + float(mean.norm())):
@@ -171,15 +164,12 @@ def estimate_up(cameras: Sequence[Camera]) -> Tensor:  # [3] float64, unit
     edges. If all cameras look in one direction, up is the mean direction from the lower to the upper edges. A ValueError if there
     are no cameras, or their upper edges cancel.
     """
-    if not (cameras := getattr(cameras, "cameras", cameras)):
-        raise ValueError("cameras: expected at least one camera, got none; give up as a vector instead")
-    R = torch.stack([camera.viewmat[:3, :3].detach().double().cpu() for camera in cameras])
+    views = as_cameras(cameras, advice := "give up as a vector instead")
+    R = torch.stack([camera.viewmat[:3, :3].detach().double().cpu() for camera in views])
     right, mean_up = R[:, 0], -R[:, 1].mean(0)
     if float(mean_up.norm()) < LEVEL:
-        raise ValueError(
-            f"cameras: expected pictures that are held upright, got {len(cameras)} whose upper edges cancel; give up as a "
-            "vector instead"
-        )
+        got = f"{len(views)} whose upper edges cancel; {advice}"
+        raise ValueError(f"cameras: expected pictures that are held upright, got {got}")
     values, vectors = torch.linalg.eigh(right.T @ right / len(right))
     if float(values[1]) < LEVEL:
         return mean_up / mean_up.norm()

@@ -6,28 +6,28 @@ The convention is `Camera`'s. The camera's matrices follow the dtype and device 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
-from kornia.geometry.calibration import distort_points
-from kornia.geometry.camera import PinholeCamera, distort_points_affine, distort_points_kannala_brandt
-from kornia.geometry.conversions import convert_points_from_homogeneous
+from kornia.geometry.camera import PinholeCamera
+from kornia.geometry.conversions import Rt_to_matrix4x4, convert_points_from_homogeneous
 from kornia.geometry.depth import depth_to_3d_v2
+from kornia.geometry.vector import Vector2
+from kornia.sensors.camera import CameraModel
+from kornia.sensors.camera.projection_model import Z1Projection
 from torch import Tensor
 
 from .._check import as_tensor, check_range, check_shapes
-from .camera import Camera, Distortion
+from .camera import Camera, Distortion, DistortionModel, kornia_model
 
+Cameras: TypeAlias = Camera | Sequence[Camera] | PinholeCamera  # a Scene and a field stand for their `cameras`
 MAX_SLOPE = 1e4  # |x / z| beyond which a distorted point is clamped (89.99 degrees): r^6 must not overflow float32
 
 
 def world_to_camera(camera: Camera, points: Tensor) -> Tensor:  # points: [N, 3] -> [N, 3]
-    """Express world points in the camera's frame: R X + t.
-
-    Written out because kornia's `transform_points` divides by a homogeneous coordinate that is always 1 here, and takes
-    twice as long.
-    """
+    """Express world points in the camera's frame: R X + t. kornia's `transform_points` divides by 1, and takes twice as long."""
     check_shapes(("points", points := as_tensor("points", points, floating=True), "N 3"))
     return points @ camera.R.to(points).T + camera.t.to(points)
 
@@ -49,19 +49,12 @@ def plane_to_pixel(
 ) -> Tensor:  # [..., 2]
     """Map points of the z = 1 plane to pixels: u = fx D(x, y)_x + cx, v = fy D(x, y)_y + cy, with D the lens.
 
-    D is kornia's `distort_points` or `distort_points_kannala_brandt`, which agree with COLMAP's camera models. K decides where
-    pixel centres are. With a lens, slopes are clamped at 1e4, so that a point at the camera's side gives a large number
-    instead of NaN.
+    D is that of kornia's `CameraModel`, which agrees with COLMAP's camera models. K decides where pixel centres are. With a lens,
+    slopes are clamped at 1e4, so that a point at the camera's side gives a large number instead of NaN.
     """
-    intrinsics = torch.stack([K[0, 0], K[1, 1], K[0, 2], K[1, 2]])
-    if distortion is None:
-        return distort_points_affine(plane, intrinsics)
-    coefficients = torch.tensor(distortion.coefficients, dtype=plane.dtype, device=plane.device)
-    plane = plane.clamp(-MAX_SLOPE, MAX_SLOPE)
-    if distortion.model == "kannala_brandt":
-        return distort_points_kannala_brandt(plane, torch.cat([intrinsics, coefficients]))
-    identity = torch.eye(3, dtype=K.dtype, device=K.device)
-    return distort_points(plane.reshape(-1, 2), K, coefficients, new_K=identity).reshape(plane.shape)
+    model = kornia_model(K, distortion, (1, 1))
+    plane = plane if distortion is None else plane.clamp(-MAX_SLOPE, MAX_SLOPE)
+    return model.distortion.distort(model.params, Vector2(plane.reshape(-1, 2))).data.reshape(plane.shape)
 
 
 def fold_radius(distortion: Distortion) -> float:
@@ -72,27 +65,20 @@ def fold_radius(distortion: Distortion) -> float:
     r (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6), or for the fisheye of
     theta (1 + k1 theta^2 + ... + k4 theta^8) with r = tan(theta); tangential terms are ignored.
     """
-    if distortion.model == "kannala_brandt":
-        k1, k2, k3, k4 = distortion.coefficients
-        theta = math.sqrt(_first_positive_root(np.array([1, 3 * k1, 5 * k2, 7 * k3, 9 * k4])))
-        return math.tan(theta) if theta < math.pi / 2 else math.inf
-    k1, k2, _, _, k3, k4, k5, k6 = (*distortion.coefficients, 0.0, 0.0, 0.0, 0.0)[:8]
-    s = np.polynomial.Polynomial([0, 1])  # r^2
-    numerator = np.polynomial.Polynomial([1, k1, k2, k3])
-    denominator = np.polynomial.Polynomial([1, k4, k5, k6])
-    slope = (numerator + 2 * s * numerator.deriv()) * denominator - 2 * s * numerator * denominator.deriv()
-    return math.sqrt(min(_first_positive_root(slope.coef), _first_positive_root(denominator.coef)))
-
-
-def _first_positive_root(coefficients: np.ndarray) -> float:
-    """Smallest positive real root of a polynomial given from the constant term up; infinity if there is none."""
-    roots = np.polynomial.polynomial.polyroots(coefficients)
-    real = roots.real[np.abs(roots.imag) < 1e-9]
-    return float(min(real[real > 0], default=math.inf))
+    (k1, k2, *rest), fisheye = distortion.coefficients, distortion.model == "kannala_brandt"
+    s = np.polynomial.Polynomial([0, 1])  # r^2, theta^2
+    P = np.polynomial.Polynomial([1, k1, k2, *(rest if fisheye else rest[2:3])])
+    Q = np.polynomial.Polynomial([1, *([] if fisheye else rest[3:])])
+    slope = (P + 2 * s * P.deriv()) * Q - 2 * s * P * Q.deriv()
+    roots = np.concatenate([slope.roots(), Q.roots()])
+    radius = math.sqrt(min((root.real for root in roots if abs(root.imag) < 1e-9 and root.real > 0), default=math.inf))
+    if fisheye:
+        return math.tan(radius) if radius < math.pi / 2 else math.inf
+    return radius
 
 
 def project_points(
-    camera: Camera,
+    camera: Cameras,
     points: Tensor,  # [N, 3] world
     *,
     near: float = 1e-6,
@@ -103,21 +89,20 @@ def project_points(
     off-axis that the lens model folds it back into the picture (`fold_radius`) is not visible.
 
     Args:
-        camera: the camera; its distortion is applied.
-        points: world coordinates; NaN and infinity count as not visible.
+        camera: the camera; its distortion is applied. Of several (a list, kornia's `PinholeCamera`) the results are stacked.
+        points: world coordinates; NaN and infinity count as not visible. [B, N, 3]: other points for each of B cameras.
         near: depth that a point must exceed, in world units; `camera.near` is for drawing and is not used here.
 
     Returns:
         Pixels (x, y), with (0, 0) for points not in front of the camera; depths along the optical axis, in world units; and
         the mask of points in front and inside the picture (0 <= x < width, 0 <= y < height). Occlusion is not considered.
-
-    Example:
-        >>> camera = Camera(torch.eye(4), torch.tensor([[100.0, 0, 32], [0, 100, 24], [0, 0, 1]]), 64, 48)
-        >>> xy, depth, visible = project_points(camera, torch.tensor([[0.2, 0.1, 2.0], [0.2, 0.1, -2.0]]))
-        >>> visible.tolist(), xy[0].tolist()
-        ([True, False], [42.0, 29.0])
     """
     check_range("near", near, 0)
+    if not isinstance(camera, Camera):
+        views, clouds = as_cameras(camera), as_tensor("points", points)
+        pairs = zip(views, clouds if clouds.ndim == 3 else [clouds] * len(views), strict=True)
+        columns = zip(*(project_points(*pair, near=near) for pair in pairs), strict=True)
+        return tuple(map(torch.stack, columns))  # type: ignore[return-value]
     points_cam = world_to_camera(camera, points)
     depth = points_cam[:, 2]
     front = ((depth > near) & torch.isfinite(points_cam).all(dim=1)).nonzero()[:, 0]
@@ -150,45 +135,68 @@ def refuse_distortion(camera: Camera) -> None:
         raise ValueError(f"camera: expected a pinhole camera, got {got}; {advice}")
 
 
-def to_kornia(cameras: Sequence[Camera]) -> PinholeCamera:
-    """Stack cameras into one kornia `PinholeCamera` of batch B = len(cameras).
+def as_cameras(cameras: Any, advice: str = "", *, one_size: bool = False) -> list[Camera]:
+    """The views that a public function was given, as a list, or a TypeError.
 
-    **Convention**: both libraries map world to camera with x right, y down, z forward, and both project by K (R X + t):
-    K decides where pixel centres are. kfgs's K puts the centre of the first pixel at (0.5, 0.5), so `project` gives the
-    pixels of `project_points`. Functions of kornia that make their own pixel grid (`create_meshgrid`, `DepthWarper`,
-    `remap`) put that centre at (0, 0): subtract 0.5 from cx and cy for them.
+    With `advice`, a ValueError that ends with it if there are none; with `one_size`, one if their maps could not be stacked.
+    """
+    if isinstance(cameras, PinholeCamera):
+        return from_kornia(cameras)
+    views = getattr(cameras, "cameras", [cameras] if isinstance(cameras, Camera) else cameras)
+    wrong = [view for view in views if not isinstance(view, Camera)] if isinstance(views, Iterable) else [views]
+    if wrong:
+        got = f"{type(wrong[0]).__name__}; take some of scene.cameras, or convert kornia's with from_kornia"
+        raise TypeError(f"cameras: expected a Camera, a list of them, a Scene or kornia's PinholeCamera, got {got}")
+    if advice and not views:
+        raise ValueError(f"cameras: expected at least one camera, got none; {advice}")
+    if one_size and len(sizes := {view.size for view in views}) != 1:
+        raise ValueError(f"cameras: expected one size, to stack what they see, got {sizes}; use camera.resized()")
+    return list(views)
+
+
+def to_kornia(cameras: Cameras) -> PinholeCamera:
+    """Stack cameras into one kornia `PinholeCamera` of batch B = len(cameras). `Camera.model` is kornia's camera with a lens.
+
+    **Convention**: both libraries map world to camera with x right, y down, z forward, and project by K (R X + t), so
+    `project` gives the pixels of `project_points`, without its tests for front and border. kornia's own pixel grids
+    (`create_meshgrid`, `DepthWarper`, `remap`) put the centre of the first pixel at (0, 0): subtract 0.5 from cx and cy.
 
     Returns:
         `intrinsics` and `extrinsics` [B, 4, 4] in the widest dtype, `height` and `width` [B] int64, counted from the origin
-        of the first camera. Names, `near` and that origin are lost. `project` does not test for front and border. A
-        ValueError if there is no camera, or one has distortion.
-
-    Example:
-        >>> camera = Camera(torch.eye(4), torch.tensor([[100.0, 0, 32], [0, 100, 24], [0, 0, 1]]), 64, 48)
-        >>> to_kornia([camera]).project(torch.tensor([[[0.2, 0.1, 2.0]]]))
-        tensor([[[42., 29.]]])
+        of the first camera. Names, `near` and that origin are lost. A ValueError if there is no camera, or one has distortion.
     """
-    if not (cameras := getattr(cameras, "cameras", cameras)):
-        raise ValueError("cameras: expected at least one Camera, got none; select a view that the scene has")
-    cameras = [camera.with_origin(cameras[0].origin) for camera in cameras]
-    for camera in cameras:
-        refuse_distortion(camera)
-    viewmats, Ks = (torch.stack([getattr(camera, name) for camera in cameras]) for name in ("viewmat", "K"))
+    views = as_cameras(cameras, "select a view that the scene has")
+    views = [view.with_origin(views[0].origin) for view in views]
+    for view in views:
+        refuse_distortion(view)
+    viewmats, Ks = (torch.stack([getattr(view, name) for view in views]) for name in ("viewmat", "K"))
     dtype = torch.promote_types(viewmats.dtype, Ks.dtype)
-    intrinsics = torch.eye(4, dtype=dtype, device=viewmats.device).repeat(len(cameras), 1, 1)
-    intrinsics[:, :3, :3] = Ks
-    sizes = torch.tensor([camera.size for camera in cameras], device=viewmats.device)
-    return PinholeCamera(intrinsics, viewmats.to(dtype), height=sizes[:, 0], width=sizes[:, 1])
+    height, width = torch.tensor([view.size for view in views], device=viewmats.device).T
+    intrinsics = Rt_to_matrix4x4(Ks, torch.zeros_like(Ks[..., :1]))  # [B, 4, 4]
+    return PinholeCamera(intrinsics.to(dtype), viewmats.to(dtype), height, width)
 
 
-def from_kornia(pinhole: PinholeCamera) -> list[Camera]:
-    """The cameras of a kornia batch, one by one: the inverse of `to_kornia`.
+def from_kornia(pinhole: PinholeCamera | CameraModel, pose: Any = None) -> list[Camera]:
+    """The cameras of a kornia batch, one by one: the inverse of `to_kornia`, and of `Camera.model` and `Camera.pose`.
 
     Of `intrinsics` only the upper left 3 x 3 is read, as kornia does, and it is not changed. kornia's documentation puts pixel
     centres on integers: add 0.5 to cx and cy of such a K first. A K from COLMAP has them on halves already.
+
+    Args:
+        pinhole: a `PinholeCamera`, or a `CameraModel` with or without a lens (all but the orthographic one).
+        pose: of a `CameraModel`, from world to camera: an `Se3`, a `NamedPose` or a matrix [4, 4]; None: the identity.
     """
-    count = pinhole.batch_size
-    check_shapes(*((f"pinhole.{name}", getattr(pinhole, name), (count, 4, 4)) for name in ("intrinsics", "extrinsics")))
+    if not isinstance(pinhole, PinholeCamera):
+        if not isinstance(getattr(pinhole, "projection", None), Z1Projection):
+            raise TypeError(f"pinhole: expected a PinholeCamera or a perspective CameraModel, got {pinhole!r:.120}")
+        rows = pinhole.params.reshape(-1, pinhole.params.shape[-1])  # fx, fy, cx, cy, coefficients
+        kind: DistortionModel = "brown_conrady" if rows.shape[1] == 12 else "kannala_brandt"
+        lenses = [Distortion(kind, tuple(row[4:].tolist())) if len(row) > 4 else None for row in rows]
+        Ks = torch.eye(3).to(rows).repeat(len(rows), 1, 1)
+        Ks[:, [0, 1, 0, 1], [0, 1, 2, 2]] = rows[:, :4]
+        size, pose = (int(pinhole.width), int(pinhole.height)), torch.eye(4).to(rows) if pose is None else pose
+        return [Camera(pose, K, *size, distortion=lens) for K, lens in zip(Ks, lenses, strict=True)]
+    shape = pinhole.batch_size, 4, 4
+    check_shapes(*((f"pinhole.{name}", getattr(pinhole, name), shape) for name in ("intrinsics", "extrinsics")))
     viewmats, Ks = pinhole.extrinsics.clone(), pinhole.camera_matrix.clone()  # kornia's scale_ changes them in place
-    rows = zip(viewmats, Ks, pinhole.width.tolist(), pinhole.height.tolist(), strict=True)
-    return [Camera(*row) for row in rows]
+    return list(map(Camera, viewmats, Ks, pinhole.width.tolist(), pinhole.height.tolist()))

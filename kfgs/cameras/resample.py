@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Literal
 
 import torch
 from kornia.geometry import create_meshgrid, remap
@@ -49,13 +50,11 @@ def resize_map(
 
     Args:
         map: any number of channels, last (`from_bchw`), floating point (resize labels with `resize_labels`).
-        size: (height, width) of the result.
         antialias: blur before shrinking (kornia's Gaussian). It matters from a factor of about 2, where plain bilinear sampling
             skips pixels and leaves them without gradient.
         align_corners: True puts the centres of corner pixels on each other, as LSeg and the paper's script do.
     """
-    map = as_tensor("map", map)
-    check_shapes(("map", map, "H W D"))
+    check_shapes(("map", map := as_tensor("map", map), "H W D"))
     if not map.is_floating_point():
         raise TypeError(f"map: expected floating point, got {map.dtype}; use resize_labels for class indices")
     check_size(size)
@@ -71,8 +70,7 @@ def resize_labels(labels: Tensor, size: tuple[int, int]) -> Tensor:  # [H, W] in
     Row i of the result reads row floor((i + 0.5) H / h), in whole numbers. kornia's `resize(interpolation="nearest")` takes
     floor(i H / h), the label at the pixel's corner, and neither it nor "nearest-exact" accepts int64.
     """
-    labels = as_tensor("labels", labels)
-    check_shapes(("labels", labels, "H W"))
+    check_shapes(("labels", labels := as_tensor("labels", labels), "H W"))
     if labels.is_floating_point():
         raise TypeError(f"labels: expected integers, got {labels.dtype}; use resize_map for continuous values")
     check_size(size)
@@ -98,21 +96,23 @@ def check_layout(name: str, shape: Sequence[int], size: tuple[int, int]) -> None
         raise ValueError(f"{name}: expected [h, w, D] in the shape of {size[0]} x {size[1]}, got {got}")
 
 
-def undistort(image: Tensor, camera: Camera) -> tuple[Tensor, Camera, Tensor]:  # image: [H, W, C]; also the mask [H, W]
+def undistort(
+    image: Tensor,  # [H, W, C]
+    camera: Camera,
+    *,
+    mode: Literal["bilinear", "nearest"] = "bilinear",
+) -> tuple[Tensor, Camera, Tensor]:  # also the mask [H, W]
     """Undistort a picture or a feature map; K, pose and size stay.
 
-    Each pixel of the result looks up, bilinearly, where its ray fell in the distorted picture. kornia's `undistort_image` does
-    the same two steps (distort the grid, remap), but has no fisheye model and no mask.
+    Each pixel of the result looks up, by `mode`, where its ray fell in the distorted picture. kornia's `undistort_image` does
+    the same two steps (distort the grid, remap), but has no fisheye model and no mask. Without a lens, nothing changes.
 
     Args:
-        image: any number of channels, floating point, as large as the camera says (a smaller feature map:
-            `camera.resized(h, w)`).
-        camera: the camera that took it. Without distortion the picture is returned unchanged.
+        image: any number of channels, floating point, of the camera's size (a feature map's: `camera.resized(h, w)`).
 
     Returns:
-        The picture, 0 at unrecorded pixels; the camera without distortion; and the mask of recorded pixels. Pixels beyond the
-        border of the picture, or beyond the `fold_radius` of the lens model, are not recorded. Within half a pixel of the
-        border the outermost pixel is repeated.
+        The picture, 0 at unrecorded pixels; the camera without distortion; and the mask of recorded pixels: those within the
+        distorted picture and the `fold_radius` of the lens. Within half a pixel of the border the outermost pixel is repeated.
     """
     check_shapes(("image", image := as_tensor("image", image), f"{camera.height} {camera.width} C"))
     if not image.is_floating_point():
@@ -120,8 +120,15 @@ def undistort(image: Tensor, camera: Camera) -> tuple[Tensor, Camera, Tensor]:  
     if camera.distortion is None:
         return image, camera, torch.ones(camera.size, dtype=torch.bool, device=image.device)
     dtype = torch.promote_types(image.dtype, torch.float32)  # half precision cannot tell the pixels of a row apart
-    result, recorded = _straightened(image.to(dtype), camera, "bilinear")
-    return result.to(image.dtype), replace(camera, distortion=None), recorded
+    K = camera.intrinsics_at_integer_centers.to(image.device, dtype)  # as kornia's grid and remap count
+    plane = normalize_points_with_intrinsics(create_meshgrid(*camera.size, False, image.device, dtype)[0], K)
+    x, y = plane_to_pixel(plane, K, camera.distortion).unbind(-1)
+    recorded = (x >= -0.5) & (x < camera.width - 0.5) & (y >= -0.5) & (y < camera.height - 0.5)
+    recorded &= plane.norm(dim=-1) < fold_radius(camera.distortion)
+    # with remap's default align_corners even an identity map changes the picture (kornia#4504)
+    result = remap(to_bchw(image.to(dtype)), x[None], y[None], mode, "border", align_corners=True)
+    result = from_bchw(result).where(recorded[..., None], 0).to(image.dtype)
+    return result, replace(camera, distortion=None), recorded
 
 
 def undistort_labels(labels: Tensor, camera: Camera) -> Tensor:  # [H, W] integer -> [H, W], dtype of labels
@@ -129,27 +136,5 @@ def undistort_labels(labels: Tensor, camera: Camera) -> Tensor:  # [H, W] intege
     check_shapes(("labels", labels, f"{camera.height} {camera.width}"))
     if labels.is_floating_point() or not torch.iinfo(labels.dtype).min:
         raise TypeError(f"labels: expected signed integers, got {labels.dtype}; convert them with .long()")
-    if camera.distortion is None:
-        return labels
-    result, recorded = _straightened(labels[..., None].double(), camera, "nearest")
-    return result[..., 0].to(labels.dtype).where(recorded, -1)
-
-
-def _straightened(
-    map: Tensor, camera: Camera, mode: str
-) -> tuple[Tensor, Tensor]:  # [H, W, C] -> [H, W, C], [H, W] bool
-    """A map without the lens, 0 where nothing was recorded, and where something was.
-
-    kornia's grid and remap put pixel centres on integers, so K is shifted by half a pixel here.
-    """
-    assert camera.distortion is not None
-    height, width = camera.size
-    K = camera.intrinsics_at_integer_centers.to(map)
-    grid = create_meshgrid(height, width, normalized_coordinates=False, device=map.device, dtype=map.dtype)[0]
-    plane = normalize_points_with_intrinsics(grid, K)
-    x, y = plane_to_pixel(plane, K, camera.distortion).unbind(-1)
-    recorded = (x >= -0.5) & (x < width - 0.5) & (y >= -0.5) & (y < height - 0.5)
-    recorded &= plane.norm(dim=-1) < fold_radius(camera.distortion)
-    # with remap's default align_corners even an identity map changes the picture (kornia#4504)
-    result = remap(to_bchw(map), x[None], y[None], mode=mode, padding_mode="border", align_corners=True)
-    return from_bchw(result).where(recorded[..., None], 0), recorded
+    straight, _, recorded = undistort(labels[..., None].double(), camera, mode="nearest")  # exact up to 2^53
+    return straight[..., 0].to(labels.dtype).where(recorded, -1)

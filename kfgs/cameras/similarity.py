@@ -6,11 +6,12 @@ import math
 from dataclasses import dataclass, replace
 
 import torch
+from kornia.geometry.liegroup import Se3
 from torch import Tensor
 
 from .._check import ORIGIN, as_tensor, check_range, check_shapes
 from .._origin import FAR_UNITS, Origin
-from .camera import Camera, exact_rotation
+from .camera import Camera, as_matrix, exact_rotation
 
 LAST_ROW_TOLERANCE = 1e-5  # a float32 matrix inverse leaves 1e-7 there
 
@@ -21,11 +22,6 @@ class Similarity:
 
     **Convention**: points are columns; rotation and translation are copied to float64 on the CPU. The rotation is the exact
     rotation nearest to the given matrix; a matrix that is not nearly a rotation is refused.
-
-    Example:
-        >>> quarter = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # x to y
-        >>> Similarity(2.0, quarter, torch.tensor([0.0, 0.0, 1.0])).apply(torch.tensor([[1.0, 0.0, 0.0]]))
-        tensor([[0., 2., 1.]])
     """
 
     scale: float  # > 0
@@ -34,7 +30,7 @@ class Similarity:
 
     def __post_init__(self) -> None:
         check_range("scale", self.scale, 0, closed=(False, False))
-        rotation, shift = as_tensor("rotation", self.rotation), as_tensor("translation", self.translation)
+        rotation, shift = as_tensor("rotation", as_matrix(self.rotation)), as_tensor("translation", self.translation)
         check_shapes(("rotation", rotation, "3 3"), ("translation", shift, "3"))
         if not torch.isfinite(shift).all():
             raise ValueError(f"translation: expected finite numbers, got {shift.tolist()}; check the fit")
@@ -55,7 +51,7 @@ class Similarity:
     @staticmethod
     def from_matrix(matrix: Tensor) -> Similarity:  # [4, 4]
         """Read scale, rotation and translation from [[s R, t], [0, 1]]; a ValueError if it shears, mirrors or is projective."""
-        matrix = as_tensor("matrix", matrix).detach().double().cpu()
+        matrix = as_tensor("matrix", as_matrix(matrix)).detach().double().cpu()
         check_shapes(("matrix", matrix, "4 4"))
         if not (matrix[3] - matrix.new_tensor([0.0, 0.0, 0.0, 1.0])).abs().max() <= LAST_ROW_TOLERANCE:  # NaN fails
             raise ValueError(f"matrix: expected the last row 0 0 0 1, got {matrix[3].tolist()}; pass points as columns")
@@ -71,6 +67,13 @@ class Similarity:
         matrix = torch.eye(4, dtype=torch.float64)
         matrix[:3, :3], matrix[:3, 3] = self.scale * self.rotation, self.translation
         return matrix
+
+    @property
+    def pose(self) -> Se3:
+        """The motion as kornia's `Se3`, of scale 1 (ValueError); `Similarity.from_matrix` takes one, too."""
+        if not math.isclose(self.scale, 1, rel_tol=1e-6):
+            raise ValueError(f"scale: expected 1, as every Se3 has, got {self.scale:g}; move the points by .apply()")
+        return Se3.from_matrix(self.matrix())
 
     def apply(self, points: Tensor) -> Tensor:  # [N, 3] -> [N, 3]
         """Move points; computed in float64, returned in their dtype and on their device."""

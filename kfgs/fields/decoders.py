@@ -195,10 +195,8 @@ class Autoencoded(_Quantised):
 
     def __post_init__(self) -> None:
         if self.autoencoder.dim != self.codebook.dim:
-            raise ValueError(
-                f"autoencoder: expected {self.codebook.dim} decoded channels (from codebook), got {self.autoencoder.dim}; "
-                "pass the autoencoder that was fitted to this codebook"
-            )
+            got = f"{self.autoencoder.dim}; pass the autoencoder that was fitted to this codebook"
+            raise ValueError(f"autoencoder: expected {self.codebook.dim} decoded channels (from codebook), got {got}")
 
     @property
     def latent(self) -> int:

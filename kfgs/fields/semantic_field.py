@@ -14,7 +14,7 @@ from torch import Tensor
 from .._card import html_card
 from .._check import as_tensor, check_shapes, check_whole
 from .._rows import unit_embeddings
-from ..cameras import Camera
+from ..cameras import Camera, Cameras, as_cameras
 from ..cameras.camera import view_named
 from ..gaussians import Gaussians, as_rows
 from ..labels import LabelSet, Part, Selection, connected_parts, number_instances
@@ -23,7 +23,8 @@ from ..labels.label_set import Classes, Negatives, check_rows, class_rows, make_
 from ..labels.scores import Score
 from ..labels.selection import select_by_similarity
 from ..metrics import MIB, semantic_storage_bytes
-from ..splat import Ranked, Rendering, rasterize
+from ..splat import Rendering, rasterize
+from ..splat.engines.contract import Ranked
 from ..splat.rasterize import Votes, rank_votes
 from .decoders import Decoder
 from .packing import Precision
@@ -139,7 +140,8 @@ class SemanticField:
     def render(self, camera: Camera | str, *, engine: str = "auto") -> Rendering:
         """The latent map F_r (Eq. 3) from a viewpoint, with its alpha. No gradient.
 
-        Here and below, a viewpoint is a camera, or the name of one of the field's own: `field.segment("f01")`.
+        Here and below, a viewpoint is a camera, or the name of one of the field's own: `field.segment("f01")`; `render` and
+        `segment` also take several of one size, as a list or kornia's `PinholeCamera`.
         """
         with torch.no_grad():
             return rasterize(self.gaussians, view_named(self.cameras, camera, "camera"), engine=engine)
@@ -217,8 +219,10 @@ class SemanticField:
         cameras = cameras or self.cameras
         return connected_parts(number_instances(self, cameras), self.query(name), cameras)
 
-    def segment(self, camera: Camera | str, classes: Classes | None = None) -> Tensor:  # [H, W] int64
-        """The class of each pixel from a viewpoint, -1 for empty pixels; the rule is that of the decoder."""
+    def segment(self, camera: Cameras | str, classes: Classes | None = None) -> Tensor:  # [H, W] int64
+        """The class of each pixel from a viewpoint, -1 for empty pixels, by the decoder's rule; of several cameras [B, H, W]."""
+        if not isinstance(camera, Camera | str):
+            return torch.stack([self.segment(view, classes) for view in as_cameras(camera, "pass one", one_size=True)])
         return self.rank(camera, classes, early=True).labels[..., 0]
 
     def rank(

@@ -19,7 +19,7 @@ from .._arrays import reading
 from .._card import short_repr
 from .._check import ORIGIN, Progress, as_progress, as_tensor
 from .._files import as_path, atomic_path, digest_value
-from ..cameras import Camera
+from ..cameras import Camera, as_cameras
 from ..cameras.paths import camera_extent
 from ..gaussians import Gaussians, check_gaussians
 from ..splat import rasterize
@@ -85,10 +85,9 @@ def fit_field(
     training, progress = training or Training(), as_progress(progress)
     check_gaussians(gaussians)
     if not len(gaussians) or (gaussians.features is None and gaussians.sh is None):
-        raise ValueError(
-            f"gaussians: expected some with features [N, d] or sh [N, K, 3], got {gaussians!r}; gaussians_from_points makes them"
-        )
-    if not (cameras := getattr(cameras, "cameras", cameras)) or len(cameras) != len(targets):
+        got = f"{gaussians!r}; gaussians_from_points makes them"
+        raise ValueError(f"gaussians: expected some with features [N, d] or sh [N, K, 3], got {got}")
+    if not (cameras := as_cameras(cameras)) or len(cameras) != len(targets):
         got = f"{len(targets)}; pass the views that have maps"
         raise ValueError(f"targets: expected one map per camera ({len(cameras)}, at least one), got {got}")
     if gaussians.origin == ORIGIN:

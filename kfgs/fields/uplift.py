@@ -26,7 +26,7 @@ from tqdm import tqdm
 
 from .._check import as_bar, check_range, check_whole
 from .._rows import EPS, row_norms, unit_rows
-from ..cameras import Camera, resize_map
+from ..cameras import Camera, as_cameras, resize_map
 from ..formats.values import check_splats
 from ..gaussians import Gaussians
 from ..quant.grow import cap
@@ -114,11 +114,10 @@ def uplift_maps(
         ValueError: if counts or shapes disagree, `write_splats` would refuse the Gaussians, a map is not finite, no map has
             features, or no view shows any Gaussian.
     """
-    config, progress, cameras = config or UpliftConfig(), as_bar(progress), getattr(cameras, "cameras", cameras)
+    config, progress, cameras = config or UpliftConfig(), as_bar(progress), as_cameras(cameras)
     if (count := len(cameras)) == 0 or count != len(maps):
-        raise ValueError(
-            f"maps: expected one per camera ({count}, at least one), got {len(maps)}; pass the views that have maps"
-        )
+        got = f"{len(maps)}; pass the views that have maps"
+        raise ValueError(f"maps: expected one per camera ({count}, at least one), got {got}")
     if len(gaussians) == 0:
         raise ValueError("gaussians: expected at least one, got none; there is nothing to carry features to")
     cloud = gaussians.replace(sh=None, features=None, labels=None, scores=None, names=(), extra={}).detach()
@@ -237,8 +236,7 @@ def fuse_views(field: SemanticField, cameras: Sequence[Camera]) -> SemanticField
     The result is the field with these `cameras` and the averages as `fused`. A field with a `Linear` decoder is fused
     already, and gets the cameras alone. Without a codebook, rendered features are averaged without quantising.
     """
-    if not (cameras := getattr(cameras, "cameras", cameras)):
-        raise ValueError("cameras: expected at least one, got none; pass those that the field was trained with")
+    cameras = as_cameras(cameras, "pass those that the field was trained with")
     decoder, gaussians = field.decoder, field.gaussians
     if isinstance(decoder, Linear):
         return replace(field, cameras=tuple(cameras))

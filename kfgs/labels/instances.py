@@ -18,7 +18,7 @@ from scipy.spatial.distance import pdist, squareform
 from skimage.measure import label as connected_pixels
 
 from .._arrays import Array
-from ..cameras import Camera
+from ..cameras import Camera, as_cameras
 from ..gaussians import Gaussians
 from ..splat.rasterize import rasterize
 from ..splat.views import sum_pixels
@@ -42,8 +42,7 @@ def number_instances(gaussians: Any, cameras: Sequence[Camera]) -> Gaussians:
             if there is none.
     """
     cloud = as_cloud(gaussians, labelled=True)
-    if not (cameras := getattr(cameras, "cameras", cameras)):
-        raise ValueError("cameras: expected at least one view, got none; connected_parts goes by distance alone")
+    cameras = as_cameras(cameras, "connected_parts goes by distance alone")
     assert cloud.labels is not None
     labels, means = cloud.labels.cpu().numpy(), positions("gaussians.means", cloud.means)
     cell, grids, whole = np.zeros(len(labels), np.int64), {}, spacing(means)

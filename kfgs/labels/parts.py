@@ -13,7 +13,7 @@ from .._card import say_coordinate, short_repr
 from .._check import as_tensor, check_range, check_shapes, check_whole
 from .._origin import to_world
 from .._rows import check_finite
-from ..cameras import Camera
+from ..cameras import Camera, as_cameras
 from ..gaussians import Gaussians
 from ..splat.rasterize import rasterize
 from .components import SPECK, number_parts
@@ -143,7 +143,7 @@ def connected_parts(
         smallest: parts with fewer Gaussians are left out; None: those below 5 % of the largest.
         most: the most parts to return.
     """
-    gaussians, cameras = as_cloud(gaussians), getattr(cameras, "cameras", cameras)
+    gaussians, cameras = as_cloud(gaussians), as_cameras(cameras or ())
     selection = as_selection(selection, gaussians)
     check_shapes(("gaussians.means", gaussians.means, "N 3"), ("selection.mask", selection.mask, "N"))
     check_whole("most", most, 1)
@@ -158,7 +158,7 @@ def connected_parts(
     kept = names[order[sizes[order] >= least]].tolist()
     members, parts = [(numbers == name).nonzero()[:, 0] for name in kept], []
     marks = (numbers[:, None] == numbers.new_tensor(kept)).to(gaussians.means)
-    shown, views = gaussians.replace(features=marks), [camera.fitted(LONGEST) for camera in cameras or ()]
+    shown, views = gaussians.replace(features=marks), [camera.fitted(LONGEST) for camera in cameras]
     shares = torch.stack([rasterize(shown, view).map.mean(dim=(0, 1)) for view in views] or [torch.zeros(len(kept))])
     for i, indices in enumerate(members):
         points = to_world(gaussians.means[indices].detach().double(), gaussians.origin)

@@ -14,7 +14,7 @@ from torch import Tensor
 from .._check import ORIGIN, check_choice, check_range
 from .._files import as_path
 from .._origin import recounted
-from ..cameras import Camera
+from ..cameras import Camera, as_cameras
 from ..cameras.similarity import Similarity
 from ..fields import SemanticField, fuse_views
 from ..formats import find_format, read_splats, write_splats
@@ -107,7 +107,7 @@ def attach(
     if not hasattr(field, "label"):
         raise TypeError(f"field: expected a SemanticField, got {type(field).__name__}; SemanticField.load opens one")
     splats = read_splats(splats) if isinstance(splats, str | Path) else splats
-    cameras = list(getattr(cameras, "cameras", cameras) or field.cameras)
+    cameras = as_cameras(cameras or field.cameras)
     by = by or ("views" if cameras else "distance")
     check_choice("by", by, ("distance", "views"))
     if distance is not None:
@@ -165,7 +165,7 @@ def _common_frame(
     if isinstance(frame, Similarity):
         return frame, None, "the similarity between the frames was given"
     if frame is not None:
-        alignment = align_by_cameras(cameras, getattr(frame, "cameras", frame))
+        alignment = align_by_cameras(cameras, as_cameras(frame))
         return alignment.similarity, alignment, f"aligned by {alignment.summary}"
     origin, solid = field.gaussians.origin, []
     for cloud in (field.gaussians, splats):

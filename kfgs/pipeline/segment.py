@@ -14,7 +14,7 @@ from tqdm import tqdm
 
 from .._check import check_range
 from .._files import Names, as_path, atomic_path, check_output, file_stem, read_json
-from ..cameras import Camera
+from ..cameras import Camera, as_cameras
 from ..cameras.resample import resize_labels
 from ..evaluation import evaluate_segmentation
 from ..evaluation.coco import save_coco
@@ -102,7 +102,7 @@ def segment_cameras(
     Returns:
         The label map [H, W] of each camera by its name, without a suffix such as .png.
     """
-    cameras = getattr(cameras, "cameras", cameras)
+    cameras = as_cameras(cameras)
     names = [file_stem(camera.name or "") for camera in cameras]
     if len(set(names)) != len(names) or not all(map(is_inside, names)):
         raise ValueError(

@@ -7,7 +7,6 @@ from .engines import (
     composite,
     free_memory,
 )
-from .engines.contract import Ranked
 from .project import Projected, project
 from .rasterize import Rendering, rasterize, rasterize_labels
 from .tiles import Tiles, bin_tiles
@@ -17,7 +16,6 @@ from .views import average_views, vote_labels
 __all__ = [
     "ALPHA_MIN",
     "Projected",
-    "Ranked",
     "Rendering",
     "Tiles",
     "accumulate_pixels",

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from .._card import html_card, short_value
 from .._check import as_array
-from ..cameras.camera import Camera
+from ..cameras import Camera, Cameras, as_cameras
 from ..gaussians import Gaussians, check_gaussians
 from .engines import composite, rank_channels
 from .engines.contract import Engine, Ranked
@@ -23,7 +23,7 @@ LAYERS = 32  # of `Rendering.depth`; 64 change it by less than 0.002 m
 
 
 class Rendering(NamedTuple):
-    """What a camera sees."""
+    """What a camera sees. Of B cameras, tensors have B as their first axis, and `projected` is a list."""
 
     map: Tensor  # [H, W, D] features, or red, green, blue
     alpha: Tensor  # [H, W] opacity in [0, 1): 1 - transmittance
@@ -36,6 +36,8 @@ class Rendering(NamedTuple):
         The rendering weights are summed in 32 layers of equally many Gaussians; the layer where half is reached gives its mean
         depth. On a colour field of the toy room half of the pixels are within 0.05 m (by the mean of all depths: 0.07 m).
         """
+        if self.alpha.ndim == 3:
+            return torch.stack([view.depth for view in map(Rendering, *self)])  # type: ignore[arg-type]
         seen, (height, width) = self.projected, self.alpha.shape
         if not len(seen.depths):
             return torch.zeros_like(self.alpha)
@@ -53,23 +55,28 @@ class Rendering(NamedTuple):
         return as_array(self.map)
 
     def __repr__(self) -> str:
-        return f"Rendering(map {short_value(self.map)}, {len(self.projected.index)} Gaussians in sight)"
+        return f"Rendering(map {short_value(self.map)}, {self._count} Gaussians in sight)"
+
+    @property
+    def _count(self) -> int:
+        views: Any = [self.projected] if self.alpha.ndim == 2 else self.projected
+        return sum(len(seen.index) for seen in views)
 
     def _repr_html_(self) -> str:
-        height, width, channels = self.map.shape
+        height, width, channels = self.map.shape[-3:]
         facts = {
             "size": f"{width} x {height} pixels",
             "channels": channels,
             "numbers": short_value(self.map),
             "covered": f"{float((self.alpha.detach() > 0.5).float().mean()):.1%} of the pixels are more than half opaque",
-            "Gaussians in sight": len(self.projected.index),
+            "Gaussians in sight": self._count,
         }
         return html_card("Rendering", facts)
 
 
 def rasterize(
     gaussians: Gaussians,
-    camera: Camera,
+    camera: Cameras,
     *,
     background: Tensor | None = None,  # [D]
     engine: str = "auto",
@@ -82,7 +89,8 @@ def rasterize(
 
     Args:
         gaussians: with `features` or `sh`.
-        camera: a pinhole; undistort a picture from a distorting lens first.
+        camera: a pinhole; undistort a picture from a distorting lens first. Several of one size (a list, kornia's
+            `PinholeCamera` of batch B) are drawn one after the other; `kfgs.nn.GaussianRenderer` gives them as [B, D, H, W].
         background: what shows through, zeros if None; one value per channel.
         engine: see `composite`.
         near: smallest depth that is drawn, world units; None takes the camera's.
@@ -100,17 +108,17 @@ def rasterize(
     Example:
         >>> import torch
         >>> camera = Camera(torch.eye(4), torch.tensor([[10.0, 0, 2], [0, 10, 2], [0, 0, 1]]), 4, 4)
-        >>> ball = Gaussians(
-        ...     means=torch.tensor([[0.0, 0.0, 2.0]]),
-        ...     quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
-        ...     scales=torch.full((1, 3), 0.1),
-        ...     opacities=torch.tensor([0.5]),
-        ...     features=torch.tensor([[1.0, 2.0]]),
-        ... )
+        >>> shape = {"quats": torch.tensor([[1.0, 0, 0, 0]]), "scales": torch.full((1, 3), 0.1), "opacities": torch.tensor([0.5])}
+        >>> ball = Gaussians(means=torch.tensor([[0.0, 0.0, 2.0]]), features=torch.tensor([[1.0, 2.0]]), **shape)
         >>> rendering = rasterize(ball, camera, engine="reference")
         >>> rendering.map.shape, rendering.alpha[1, 1] > rendering.alpha[0, 0]
         (torch.Size([4, 4, 2]), tensor(True))
     """
+    if not isinstance(camera, Camera):
+        views = as_cameras(camera, "draw at least one", one_size=True)
+        options: Any = {"background": background, "engine": engine, "near": near}
+        maps, alphas, seen = zip(*(rasterize(gaussians, view, **options) for view in views), strict=True)
+        return Rendering(torch.stack(maps), torch.stack(alphas), list(seen))  # type: ignore[arg-type]
     _check_arguments(gaussians, camera)
     if gaussians.features is None and gaussians.sh is None:
         raise ValueError("gaussians: expected features or sh to render, got neither; add them with gaussians.replace()")
@@ -118,8 +126,8 @@ def rasterize(
     tiles = bin_tiles(projected, camera.width, camera.height, engine=engine)
     footprints = projected.means2d, projected.conics, projected.opacities
     features, index = _shown(gaussians, camera, projected, engine)
-    maps, alphas = composite(*footprints, features, tiles, background=background, index=index, engine=engine)
-    return Rendering(maps, alphas, projected)
+    pixels = composite(*footprints, features, tiles, background=background, index=index, engine=engine)
+    return Rendering(*pixels, projected)
 
 
 def rasterize_labels(
@@ -157,13 +165,9 @@ def rasterize_labels(
     Example:
         >>> import torch
         >>> camera = Camera(torch.eye(4), torch.tensor([[10.0, 0, 2], [0, 10, 2], [0, 0, 1]]), 4, 4)
-        >>> ball = Gaussians(
-        ...     means=torch.tensor([[0.0, 0.0, 2.0]]),
-        ...     quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
-        ...     scales=torch.full((1, 3), 0.02),
-        ...     opacities=torch.tensor([0.5]),
-        ...     features=torch.tensor([[0.1, 0.7, 0.2]]),
-        ... )
+        >>> shape = {"quats": torch.tensor([[1.0, 0, 0, 0]]), "scales": torch.full((1, 3), 0.02)}
+        >>> scores = {"opacities": torch.tensor([0.5]), "features": torch.tensor([[0.1, 0.7, 0.2]])}
+        >>> ball = Gaussians(means=torch.tensor([[0.0, 0.0, 2.0]]), **shape, **scores)
         >>> rasterize_labels(ball, camera, engine="reference").labels[..., 0].tolist()
         [[-1, 1, 1, -1], [1, 1, 1, 1], [1, 1, 1, 1], [-1, 1, 1, -1]]
     """
@@ -209,7 +213,9 @@ def rank_votes(gaussians: Gaussians, camera: Camera, votes: Votes, top: int = 1,
 def _check_arguments(gaussians: Gaussians, camera: Camera) -> None:
     check_gaussians(gaussians)
     if not isinstance(camera, Camera):
-        raise TypeError(f"camera: expected a Camera, got {type(camera).__name__}; take one of scene.cameras")
+        raise TypeError(
+            f"camera: expected a Camera, got {type(camera).__name__}; take one of scene.cameras, or from_kornia's"
+        )
     means = gaussians.means
     shown = "sh" if gaussians.features is None else "features"
     for name in ("quats", "scales", "opacities", shown):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import torch
+from kornia.geometry.liegroup import Se3
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
@@ -11,11 +12,12 @@ from ..gaussians import Gaussians, check_gaussians
 from .sh import rotate_sh
 
 
-def transform_gaussians(gaussians: Gaussians, similarity: Similarity) -> Gaussians:
+def transform_gaussians(gaussians: Gaussians, similarity: Similarity | Se3 | Tensor) -> Gaussians:
     """Move, turn and resize a cloud: x' = s R x + t. Cameras that move along see the same picture.
 
     Means move, quaternions are turned (q' = q_R q, keeping their length), scales grow by s, spherical harmonics turn with
-    R (`rotate_sh`). Opacities, features and labels stay as they are. dtype and device are kept; differentiable.
+    R (`rotate_sh`). Opacities, features and labels stay as they are. dtype and device are kept; differentiable. A rigid motion
+    may also be kornia's `Se3`, or a matrix [4, 4].
 
     Raises:
         TypeError: if an argument is something else.
@@ -28,11 +30,7 @@ def transform_gaussians(gaussians: Gaussians, similarity: Similarity) -> Gaussia
         (tensor([[3., 3., 4.]]), tensor([[3., 3., 3.]]))
     """
     check_gaussians(gaussians)
-    if not isinstance(similarity, Similarity):
-        raise TypeError(
-            f"similarity: expected a Similarity, got {type(similarity).__name__}; make one from a 4 x 4 matrix with "
-            "Similarity.from_matrix"
-        )
+    similarity = similarity if isinstance(similarity, Similarity) else Similarity.from_matrix(similarity)
     local, origin = similarity.between_origins(gaussians.origin)
     return gaussians.replace(
         means=local.apply(gaussians.means),

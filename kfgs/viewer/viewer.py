@@ -17,7 +17,7 @@ from torch import Tensor
 
 from .._check import check_choice
 from .._files import atomic_path
-from ..cameras import Camera
+from ..cameras import Camera, as_cameras
 from ..fields import SemanticField
 from ..formats import read_splats
 from ..gaussians import Gaussians
@@ -86,7 +86,7 @@ def explore(
     if where == "notebook":
         require_widget()
     meaning: Meaning
-    cameras = getattr(cameras or source, "cameras", cameras)
+    cameras = as_cameras(cameras or getattr(source, "cameras", ()))
     if isinstance(source, SemanticField):
         meaning = FieldMeaning(source, classes, cameras=cameras, embed=embed)
     else:

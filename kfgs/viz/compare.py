@@ -8,7 +8,7 @@ from pathlib import Path
 
 from torch import Tensor
 
-from ..cameras import Camera
+from ..cameras import Camera, as_cameras
 from ..gaussians import Gaussians
 from ..splat.rasterize import render_color
 from .pictures import picture_grid, save_picture
@@ -29,7 +29,7 @@ def views_of_change(
     others. `between` is the scene after each of several edits: then each edit gets its best view first, unless a chosen view
     shows it half as well, or it is undone later.
     """
-    cameras = getattr(cameras, "cameras", cameras)
+    cameras = as_cameras(cameras)
     small = [camera.resized(max(1, round(PREVIEW * camera.height / camera.width)), PREVIEW) for camera in cameras]
     drawn = [[render_color(state, camera) for camera in small] for state in (before, *between, after)]
     total = _shares(drawn[0], drawn[-1])

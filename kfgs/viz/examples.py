@@ -11,7 +11,7 @@ from PIL.Image import Resampling
 from torch import Tensor
 
 from .._check import as_array, check_shapes, check_whole
-from ..cameras import Camera
+from ..cameras import Camera, as_cameras
 from ..cameras.camera import view_named
 from .palette import palette
 from .pictures import LEGEND_INK, LEGEND_PAPER, Array, as_bytes, draw_legend, picture_sheet
@@ -51,7 +51,7 @@ def draw_examples(
         for i, example in enumerate(given if isinstance(given, Sequence) else [given]):
             if isinstance(example, Tensor) or not hasattr(example, "view"):
                 continue
-            camera = view_named(getattr(cameras, "cameras", cameras), example.view, f"examples[{name!r}][{i}]")
+            camera = view_named(as_cameras(cameras), example.view, f"examples[{name!r}][{i}]")
             shown.setdefault(id(camera), (camera, []))[1].append((example, color))
     if not shown:
         raise ValueError("examples: expected at least one in a view, got none; pass Clicks, a Box or a Mask")

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from .._check import as_array, check_range, check_shapes
 from .._files import atomic_path
-from ..cameras import Camera, Orbit, orbit_cameras
+from ..cameras import Camera, Orbit, as_cameras, orbit_cameras
 from ..gaussians import Gaussians
 from ..labels import Part
 from ..labels.color import parse_color
@@ -149,7 +149,7 @@ def save_animation(
         up = upwards(own)
         orbit = Orbit(zoom=1.3, cut=0.6) if enclosing(cloud, own, np.asarray(up)).any() else Orbit()  # walls hide rooms
         cameras = orbit_cameras(cloud.means, orbit, up=up, origin=cloud.origin)
-    if not named or not (cameras := getattr(cameras, "cameras", cameras)):
+    if not named or not (cameras := as_cameras(cameras or ())):
         advice = "kfgs.cameras.orbit_cameras makes some"
         raise ValueError(f"shows, cameras: expected at least one of each, got none; {advice}")
     target = check_target(path, fps)

@@ -10,7 +10,7 @@ from PIL import Image
 from torch import Tensor
 
 from .._check import as_array, check_range, check_shapes
-from ..cameras import Camera
+from ..cameras import Camera, as_cameras
 from .colors import Array
 from .linked import evenly
 from .pictures import as_bytes
@@ -52,9 +52,7 @@ def add_cameras(
     """
     import pyvista as pv
 
-    cameras = getattr(cameras, "cameras", cameras)
-    if not cameras:
-        raise ValueError("cameras: expected at least one camera, got none; load a scene with views")
+    cameras = as_cameras(cameras, "load a scene with views")
     if not callable(images) and len(images) not in (0, len(cameras)):
         raise ValueError(f"images: expected {len(cameras)} (one per camera), got {len(images)}; give one for each")
     centers = np.stack([as_array(camera.with_origin(cameras[0].origin).center) for camera in cameras])

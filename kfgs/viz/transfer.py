@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from .._check import as_array
-from ..cameras import Camera
+from ..cameras import Camera, as_cameras
 from ..gaussians import Gaussians
 from ..labels.selection import class_names
 from ..labels.transfer import Sources, as_cloud, nearest_labels, positions
@@ -66,7 +66,7 @@ def show_transfer(
     Raises:
         ValueError: if a cloud is empty, has no labels or no colours, or the distance is not positive.
     """
-    views: Sequence[Camera] = getattr(cameras or field, "cameras", cameras) or ()
+    views = as_cameras(cameras or getattr(field, "cameras", ()))
     semantic, splat = as_cloud(field, "field", labelled=True), as_cloud(splat, "splat")
     if not (as_array(semantic.labels) >= 0).any():
         raise ValueError(f"field: expected Gaussians with a class, got none in {semantic!r}; choose other classes")

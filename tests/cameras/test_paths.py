@@ -70,7 +70,7 @@ def test_a_portrait_among_landscapes_is_not_stretched():
 
 def test_what_is_no_walk_is_refused():
     keys = [camera((0, 0, 0)), camera((1, 0, 0))]
-    refused(lambda: path_cameras([], every=2), "cameras:", "got 0")
+    refused(lambda: path_cameras([], every=2), "cameras:", "got none")
     refused(lambda: path_cameras([keys[0]] * 3), "cameras:", "got 1")
     refused(lambda: path_cameras(keys[0]), "cameras: expected at least two different views, got 1")
     refused(lambda: path_cameras(keys, frames=1), "frames:", "got 1")

@@ -6,10 +6,16 @@ import pycolmap
 import pytest
 import torch
 from kornia.geometry.camera import PinholeCamera
+from kornia.geometry.liegroup import Se3, So3
+from kornia.geometry.pose import NamedPose
+from kornia.geometry.quaternion import Quaternion
+from kornia.geometry.vector import Vector3
+from kornia.image import ImageSize
+from kornia.sensors.camera import CameraModel, CameraModelType
 from messages import refused, tells
 from oracles_cameras import HEIGHT, LENSES, WIDTH, colmap_camera, colmap_pixels, project_pinhole
 
-from kfgs.cameras import Camera, Distortion, from_kornia, project_points, to_kornia
+from kfgs.cameras import Camera, Distortion, Similarity, from_kornia, project_points, to_kornia
 from kfgs.cameras.projection import camera_to_pixel, unproject_depth, world_to_camera
 
 K = torch.tensor([[70.0, 0.0, 50.0], [0.0, 66.0, 30.5], [0.0, 0.0, 1.0]], dtype=torch.float64)
@@ -175,7 +181,10 @@ CAMERAS = [posed(), Camera(OTHER, K * torch.tensor([[1.3], [1.3], [1]]), 80, HEI
 def test_kornia_projects_to_the_pixels_of_kfgs_and_lifts_them_again():
     cam = torch.from_numpy(points_in_front()[0])
     world = torch.stack([(cam - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3] for camera in CAMERAS])
-    pixels, depths, _ = (torch.stack(x) for x in zip(*map(project_points, CAMERAS, world), strict=True))
+    pixels, depths, _ = project_points(to_kornia(CAMERAS), world)
+    assert all(
+        map(torch.equal, project_points(CAMERAS, world[0])[0], [project_points(c, world[0])[0] for c in CAMERAS])
+    )
     torch.testing.assert_close(to_kornia(CAMERAS).project(world), pixels, rtol=0, atol=1e-9)
     torch.testing.assert_close(to_kornia(CAMERAS).unproject(pixels, depths[..., None]), world, rtol=0, atol=1e-12)
     assert (pixels[0] - project_points(CAMERAS[1], world[0])[0]).norm(dim=1).max() > 1  # the other camera's
@@ -189,10 +198,38 @@ def test_to_kornia_and_back():
         assert again.K.dtype == again.viewmat.dtype == torch.float64
 
 
+@pytest.mark.parametrize("model", [None, *LENSES])
+def test_kornias_model_of_a_lens_gives_the_same_pixels_and_comes_back(model):
+    camera = posed() if model is None else replace(lens_camera(model), viewmat=posed().viewmat)
+    local = points_in_front()[0]
+    expected = project_points(replace(camera, viewmat=torch.eye(4)), torch.from_numpy(local))[0]
+    torch.testing.assert_close(camera.model.project(Vector3(torch.from_numpy(local))).data, expected)
+    pose = NamedPose(camera.pose, "world", "camera")
+    for [again] in (from_kornia(camera.model, camera.pose), from_kornia(camera.model, pose)):
+        torch.testing.assert_close((again.viewmat.detach(), again.K), (camera.viewmat, camera.K))
+        world = torch.from_numpy(points_in_front()[1])
+        torch.testing.assert_close(project_points(again, world)[0].detach(), project_points(camera, world)[0])
+        assert again.size == camera.size
+
+
+def test_poses_of_kornia_are_matrices_of_kfgs():
+    turn, shift = Quaternion(torch.tensor([0.5, 0.5, -0.5, 0.5])), torch.tensor([1.0, 2.0, 3.0])
+    R, step = turn.matrix(), Similarity(1.0, turn, shift)
+    assert all(Similarity(1.0, rotation, shift).rotation.equal(step.rotation) for rotation in (R, So3(turn)))
+    batch = Se3(Quaternion(turn.data[None]), shift[None])
+    for pose in (Se3(turn, shift), batch, NamedPose(Se3(turn, shift))):
+        assert Camera(pose, K, WIDTH, HEIGHT).R.equal(R)
+        torch.testing.assert_close(Similarity.from_matrix(pose).matrix(), step.matrix())
+    torch.testing.assert_close(step.pose.matrix(), step.matrix())
+    refused(lambda: Similarity(2.0, R, shift).pose, "scale: expected 1", "got 2")
+
+
 def test_what_kornia_cannot_hold_is_refused():
     bent = replace(CAMERAS[1], distortion=Distortion("kannala_brandt", (0.1, 0, 0, 0)))
     refused(lambda: to_kornia([CAMERAS[0], bent]), "camera:", "got kannala_brandt", "'b.png'")
     refused(lambda: to_kornia([]), "cameras:", "got none")
+    flat = CameraModel(ImageSize(4, 4), CameraModelType.ORTHOGRAPHIC, torch.ones(4))
+    refused(lambda: from_kornia(flat), "pinhole:", "perspective", "Orthographic", error=TypeError)
     pinhole = to_kornia(CAMERAS)
     stacked = PinholeCamera(pinhole.intrinsics[:, None], pinhole.extrinsics[:, None], pinhole.height, pinhole.width)
     refused(lambda: from_kornia(stacked), "pinhole.intrinsics:", "[2, 4, 4]", "got (2, 1, 4, 4)")
