@@ -24,7 +24,7 @@ FLOORS = (
     {"splat", "quant", "metrics"},
     {"formats"},
     {"scenes", "labels"},
-    {"toy"},
+    {"toy", "nn"},
     {"teachers", "fields", "viz"},
     {"viewer"},
     {"evaluation"},

@@ -14,7 +14,7 @@ import kfgs
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = [
     "kfgs.cameras", "kfgs.evaluation",
-    "kfgs.fields", "kfgs.formats", "kfgs.labels", "kfgs.metrics", "kfgs.pipeline",
+    "kfgs.fields", "kfgs.formats", "kfgs.labels", "kfgs.metrics", "kfgs.nn", "kfgs.pipeline",
     "kfgs.quant", "kfgs.batch", "kfgs.scenes", "kfgs.splat", "kfgs.teachers", "kfgs.toy", "kfgs.viewer", "kfgs.viz",
 ]  # fmt: skip
 

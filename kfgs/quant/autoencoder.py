@@ -130,7 +130,7 @@ class Autoencoder(nn.Module, Stored):
 
     def encode(self, features: Tensor) -> Tensor:  # [..., D] -> [..., d] in [0, 1]
         """The latents of features (E), by their directions. Codewords fill [0, 1]; another latent is clamped to it."""
-        low, high = self.range.tolist()
+        low, high = self.range  # not as Python's numbers, which torch.compile could not trace
         unit = _by_chunk("features", features, self.dim, lambda rows: unit_latents(mlp(self.encoder, unit_rows(rows))))
         return ((unit - low) / (high - low)).clamp(0, 1)
 

@@ -192,7 +192,7 @@ def encode():
     return lambda texts: words.embeddings[[words.names.index(text) if text in words.names else 0 for text in texts]]
 
 
-AS_THEY_STAND = ["index", "howto/teacher", "howto/edit", "howto/export", "howto/pyvista", "quickstart"]
+AS_THEY_STAND = ["index", "howto/teacher", "howto/edit", "howto/export", "howto/pyvista", "howto/kornia", "quickstart"]
 ELSEWHERE = {"guide": "test_readme.py"}
 WITH_DATA = {"protocols", "howto/batch"}  # the two tests below
 
