@@ -38,10 +38,9 @@ def test_the_renderer_is_rasterize_of_each_camera_in_kornias_layout():
             expected = rasterize(CLOUD, camera, background=renderer.background)
             torch.testing.assert_close(views.map[i].permute(1, 2, 0), expected.map)
             torch.testing.assert_close((views.alpha[i, 0], views.depth[i, 0]), (expected.alpha, expected.depth))
-    assert renderer(CLOUD, CAMERAS[0]).map.equal(renderer(CLOUD, CAMERAS[:1]).map)
     assert list(renderer.state_dict()) == ["background"]
-    small = CAMERAS[1].resized(9, 12)
-    refused(lambda: renderer(CLOUD, [CAMERAS[0], small]), "cameras: expected one size", "(9, 12)", "resized")
+    other = [CAMERAS[0], CAMERAS[1].resized(9, 12)]
+    refused(lambda: renderer(CLOUD, other), "cameras: expected one size", "(9, 12)", "resized")
     refused(lambda: renderer(CLOUD, CAMERAS[0].model), "got CameraModel", "from_kornia", error=TypeError)
 
 
