@@ -1,11 +1,13 @@
 import json
 
 import numpy as np
+import pytest
 import torch
 
 import kfgs
 from kfgs import SemanticField, read_splats
 from kfgs.cli import main
+from kfgs.cli.options import Settings, Views
 from kfgs.formats.ply import read_header, read_ply, write_ply
 
 
@@ -39,7 +41,34 @@ def test_a_scene_without_points_is_told_that_some_are_found(room, tmp_path, caps
     assert main(["fit", str(tmp_path), "--out", str(tmp_path / "run")]) == 1
     said = capsys.readouterr()
     assert "triangulate some from the poses before they train" in said.out
-    assert said.err.startswith("error: --features: expected a folder of feature maps")
+    assert f"{tmp_path / 'features'}: expected a folder of feature maps" in said.err
+
+
+def test_any_option_of_a_method_is_set_by_its_name(room, tmp_path, capsys):
+    changed = Settings(
+        steps=3_000, set=("codebook.maximum=50", "training.densify.maximum=none", "autoencoder.latent=12")
+    )
+    method = changed.of(kfgs.Paper.paper())
+    assert (method.codebook.maximum, method.autoencoder.latent, method.training.densify.maximum) == (50, 12, None)
+    assert (method.training.steps, method.training.densify.stop) == (3_000, 1_500)
+    command = ["fit", str(room), "--out", str(tmp_path), "--method", "paper", "--set"]
+    for word, shown in (
+        ("alpha=1", "--alpha=1"),
+        ("training.densify.gradient=x", "'x'"),
+        ("codebook.maximum=0", "got 0"),
+    ):
+        with pytest.raises(SystemExit):
+            main([*command, word])
+        assert shown in (said := capsys.readouterr().err)
+        assert "--set help lists the names" in said
+    with pytest.raises(SystemExit):
+        main([*command, "help"])
+    assert "--training.densify.gradient FLOAT" in capsys.readouterr().out
+
+
+def test_the_papers_split_by_its_name(room):
+    scene = Views(split="df3dgs").load(room)
+    assert (scene.views("df3dgs"), scene.splits["test"]) == ([5], [0])
 
 
 def test_sfm_says_that_the_images_of_the_scene_are_a_link(tmp_path, monkeypatch, capsys):

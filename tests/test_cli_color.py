@@ -20,7 +20,7 @@ from kfgs.labels import connected_parts, load_label_set, number_instances
 from kfgs.scenes import load_scene
 from kfgs.splat import rasterize
 
-COLOR = ["--steps", "30", "--max-gaussians", "2000"]
+COLOR = ["--steps", "30", "--set", "training.densify.maximum=2000"]
 
 
 @pytest.fixture(scope="module")

@@ -106,7 +106,7 @@ def test_a_model_is_not_replaced_unasked(room, tmp_path, capsys):
 def test_two_runs_of_kfgs_give_the_same_bytes(room, tmp_path):
     one, two = tmp_path / "one", tmp_path / "two"
     for run in (one, two):
-        options = ["--method", "adc", "--steps", "10", "--max-gaussians", "2000"]
+        options = ["--method", "adc", "--steps", "10", "--set", "training.densify.maximum=2000"]
         assert main(["fit", str(room), "--out", str(run), *options]) == 0
     made = sorted(one.glob("stages/*/*.safetensors"))
     assert len(made) == 3  # the codebook, the index maps, the field

@@ -6,7 +6,7 @@ import os
 import shlex
 import sys
 from contextlib import nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -16,7 +16,7 @@ import kfgs
 
 from .._files import real_path, write_json
 from .files import say, wrote
-from .options import Flag, Given, Positional, SceneFolder, Teacher, Views
+from .options import Flag, Given, Positional, SceneFolder, Settings, Teacher, Views
 
 PICTURES = 4  # held-out views that `kfgs color` draws
 Workers = Annotated[str | None, tyro.conf.arg(metavar="NUMBER|ADDRESS", help_behavior_hint="")]
@@ -108,21 +108,6 @@ def sfm(
     wrote([out / "sparse" / "0", *([out / "images"] if linked else [])])
 
 
-@dataclass(frozen=True)
-class Amount:
-    """How long training takes, and how large the result is."""
-
-    steps: Given[int] = None
-    """Training steps; those of the method or preset when not given."""
-    max_gaussians: Given[int] = None
-    """At most this many Gaussians, 0: no limit, all of the splat; that of the method or preset when not given."""
-
-    def of(self, options: Any) -> Any:
-        """The options of a training with these numbers."""
-        training = options.training if self.steps is None else options.training.with_steps(self.steps)
-        return replace(options, training=training.with_maximum(self.max_gaussians))
-
-
 def fit(
     scene: SceneFolder,
     out: Path,
@@ -130,7 +115,7 @@ def fit(
     features: Given[Path] = None,
     splat: Given[Path] = None,
     method: Method = "uplift",
-    amount: Amount,
+    settings: Settings,
     views: Views,
     teacher: Teacher,
 ) -> None:
@@ -144,8 +129,8 @@ def fit(
         kfgs fit scene/ --out run/ --splat my.ply
         kfgs fit scene/ --out run/ --features maps/
         kfgs fit scene/ --out run/ --teacher mine:colors    # makes the maps, in OUT/features
-        kfgs fit scene/ --out run/ --splat my.ply --max-gaussians 0    # keeps every Gaussian of the splat
-        kfgs fit scene/ --out run/ --method paper
+        kfgs fit scene/ --out run/ --splat my.ply --set uplift.max_gaussians=none    # keeps every Gaussian of the splat
+        kfgs fit scene/ --out run/ --method paper --set autoencoder.latent=12
 
     Args:
         out: Run folder; OUT/field.kfgs receives the field, OUT/report.html what was made. Running again continues.
@@ -158,17 +143,17 @@ def fit(
     from ..pipeline.run_report import write_run_report
     from ..scenes.load import scene_root
 
-    made_by = _method(method, splat, amount)
+    if splat is not None and method != "uplift":
+        raise ValueError(f"splat: expected none with --method {method}, which trains its own Gaussians, got {splat}")
+    made_by: Any = kfgs.Uplift(splat)
+    if method != "uplift":
+        paper: Any = kfgs.Paper.paper() if method == "paper-full" else kfgs.Paper()
+        left_out = {"decouple": ("codebook", "autoencoder"), "adc": ("autoencoder",)}.get(method, ())
+        made_by = replace(paper, **dict.fromkeys(left_out))
+    made_by = settings.of(made_by)
     as_taken = views.load(scene)
     loaded, split = as_taken.undistorted(), views.split
-    folder = features or scene_root(scene) / "features"
-    network = teacher.load()
-    if network is None and not folder.is_dir():
-        raise ValueError(
-            f"features: expected a folder of feature maps, got {folder}, which is none; name another, or make them with "
-            "`kfgs features`"
-        )
-    maps = network or kfgs.FeatureFolder(folder).of(as_taken, split)
+    maps = teacher.load() or kfgs.FeatureFolder(features or scene_root(scene) / "features").of(as_taken, split)
     field = kfgs.fit(loaded, maps, made_by, folder=out, split=split, report=say, progress=True)
     command = f"cd {shlex.quote(os.getcwd())}\n{shlex.join(['kfgs', *sys.argv[1:]])}"
     report = write_run_report(out, field, loaded, made_by, split=split, command=command)
@@ -176,27 +161,12 @@ def fit(
     wrote([out / "field.kfgs", *report])
 
 
-def _method(method: Method, splat: Path | None, amount: Amount) -> Any:
-    """The options of `kfgs.fit` for a method's name and the given numbers."""
-    if method == "uplift":
-        made_by = kfgs.Uplift(splat)
-        if amount.max_gaussians is not None:
-            made_by = replace(made_by, uplift=replace(made_by.uplift, max_gaussians=amount.max_gaussians or None))
-        return replace(made_by, color=Amount(amount.steps).of(made_by.color))
-    if splat is not None:
-        raise ValueError(f"splat: expected none with --method {method}, which trains its own Gaussians, got {splat}")
-    paper = amount.of(kfgs.Paper.paper() if method == "paper-full" else kfgs.Paper())
-    if method == "decouple":
-        return replace(paper, codebook=None, autoencoder=None)
-    return replace(paper, autoencoder=None) if method == "adc" else paper
-
-
 def color(
     scene: SceneFolder,
     out: Path,
     *,
     preset: Literal["quick", "cpu", "paper"] = "cpu",
-    amount: Amount,
+    settings: Settings,
     views: Views,
 ) -> None:
     """Train a colour splat (3-D Gaussian Splatting) on a scene, and score it on the views held out.
@@ -214,7 +184,7 @@ def color(
     from ..viz.linked import evenly
 
     presets = {"quick": kfgs.ColorConfig.quick, "cpu": kfgs.ColorConfig.cpu, "paper": kfgs.ColorConfig}
-    config = amount.of(presets[preset]())
+    config = settings.of(presets[preset]())
     loaded, split = views.load(scene).undistorted(), views.split
     gaussians = kfgs.fit_color(loaded, out, config, split=split, report=say, progress=True)
     say(repr(gaussians))

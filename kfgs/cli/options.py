@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import sys
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -29,17 +31,45 @@ SceneFolder = Annotated[
 
 
 @dataclass(frozen=True)
+class Settings:
+    """How it is made."""
+
+    steps: Given[int] = None
+    """Training steps; the schedule is stretched to them. Those of the method or preset when not given."""
+    set: Several = ()
+    """Any other option of the method, by its name and value, as in "codebook.maximum=50" or "uplift.keep=0.99". May be given
+    several times; --set help lists all of them."""
+
+    def of(self, options: Any) -> Any:
+        """The options of a method with these values; a wrong name or value ends the command, as for any option."""
+        if self.steps is not None:
+            color = getattr(options, "color", options)
+            color = replace(color, training=color.training.with_steps(self.steps))
+            options = color if hasattr(options, "training") else replace(options, color=color)
+        kind, words = type(options), [re.sub("=none$", "=None", f"--{text}") for text in self.set]
+        style = (tyro.conf.AvoidSubcommands, tyro.conf.FlagConversionOff)
+        try:
+            return tyro.cli(kind, default=options, args=words, prog="--set", config=style) if words else options
+        except SystemExit as ended:
+            if ended.code:
+                say("--set help lists the names of all options", sys.stderr)
+            raise
+
+
+@dataclass(frozen=True)
 class Views:
     """The pictures of the scene."""
 
     images: Given[Path] = None
     """Folder of the pictures, if it is not SCENE/images."""
     split: Word = "train"
-    """Which views: train, test, all, or another split that SCENE/split.json names."""
+    """Which views: train, test, all, or another split that SCENE/split.json names; df3dgs: those that train by the paper."""
 
     def load(self, scene: Path) -> Any:
         """Load a scene as its pictures were taken, and print its notes."""
-        loaded = kfgs.load_scene(scene, images=self.images)
+        loaded = kfgs.load_scene(scene, images=self.images, split="df3dgs" if self.split == "df3dgs" else "auto")
+        if self.split == "df3dgs":
+            loaded = replace(loaded, splits={**loaded.splits, self.split: loaded.splits["train"]})
         for note in loaded.notes:
             if self.split == "all" and "all" not in loaded.splits and note.startswith("split "):
                 note = f"split all: all {len(loaded)} views"

@@ -68,7 +68,8 @@ class FeatureFolder(Sequence[Tensor]):
         self.path = as_path(path)
         if not self.path.is_dir():
             got = "a file" if self.path.exists() else "nothing there"
-            raise NotADirectoryError(f"{self.path}: expected a folder of feature maps, got {got}; check its name")
+            advice = "check its name, or make maps with `kfgs features`"
+            raise NotADirectoryError(f"{self.path}: expected a folder of feature maps, got {got}; {advice}")
         manifest = read_manifest(self.path)
         self.identity: dict[str, Any] | None = manifest.teacher if manifest else None
         """What is known about the teacher if kfgs made the maps, else None."""

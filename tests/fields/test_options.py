@@ -28,7 +28,7 @@ def test_with_steps_keeps_the_schedule_in_proportion():
 def test_a_limit_of_gaussians():
     assert Training().with_maximum(7).densify == Densify(maximum=7)
     assert Training.cpu().with_maximum(None) == Training.cpu()
-    assert Training.cpu().with_maximum(0).densify.maximum is None  # `--max-gaussians 0`
+    assert Training.cpu().with_maximum(0).densify.maximum is None
 
 
 @pytest.mark.parametrize(

@@ -225,8 +225,8 @@ def test_python_and_the_command_line_select_the_same_gaussians(fused, runs, clas
 
 def test_fit_from_the_command_line(desk, tmp_path):
     words = ["fit", str(desk / "scene"), "--splat", str(desk / "my.ply"), "--out", str(tmp_path / "run")]
-    assert main([*words, "--max-gaussians", "900"]) == 0
+    assert main([*words, "--set", "uplift.max_gaussians=900", "--set", "uplift.keep=0.9"]) == 0
     assert "half of the views explains" in (tmp_path / "run" / "report.html").read_text()
     assert len(SemanticField.load(tmp_path / "run")) <= 900
-    assert main([*words, "--max-gaussians", "0"]) == 0
+    assert main([*words, "--set", "uplift.max_gaussians=none"]) == 0
     assert len(SemanticField.load(tmp_path / "run")) == 4_000
