@@ -64,7 +64,6 @@ ERRORS = [
     ("fit {room} --out {o} --features {tmp}/no", ("{tmp}/no: expected a folder of feature maps", "`kfgs features`")),
     ("fit {room} --out {o} --features {tmp}", ("{tmp}", "expected at least one view")),
     ("fit {tmp} --out {o} --features {room}/features", ("{tmp}:", "COLMAP", "`kfgs sfm")),
-    ("fit {room} --out {o} --set uplift.max_gaussians=0", ("max_gaussians:", "got 0")),
     ("fit {room} --out {o} --split val", ("--split:", "train, test", "got 'val'")),
     ("fit {room} --out {o} --method paper --splat a.ply", ("--splat:", "--method paper", "got a.ply")),
     ("segment {tmp} --scene {room} --out {o}", ("FIELD:", "field.kfgs", "got {tmp}", "`kfgs fit`")),

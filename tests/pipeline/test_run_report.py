@@ -1,3 +1,5 @@
+"""What `kfgs convert` says of folders that are no scene."""
+
 import base64
 import dataclasses
 import re
@@ -5,11 +7,15 @@ import shutil
 
 import numpy as np
 import pytest
+import torch
+from messages import refused
 from PIL import Image
 from small_room import PAPER
 
 from kfgs.pipeline import Uplift
+from kfgs.pipeline.describe import describe
 from kfgs.pipeline.run_report import WIDTH, write_run_report
+from kfgs.scenes import SceneError
 
 
 @pytest.fixture
@@ -44,3 +50,20 @@ def test_without_photographs_there_is_a_page_still(folder, trained, scene, tmp_p
     assert [path.name for path in paths] == ["codebook.png", "field.png", "report.html"]
     assert "kfgs.fit(scene, maps, " in paths[-1].read_text()
     assert "&quot;uplift&quot;: {" in paths[-1].read_text()
+
+
+def test_a_scene_that_cannot_be_read_says_why(room, tmp_path):
+    shutil.copytree(room / "images", tmp_path / "images")
+    shutil.copytree(room / "sparse", tmp_path / "sparse")
+    (tmp_path / "sparse" / "0" / "cameras.bin").write_bytes(b"junk")
+    refused(lambda: describe(tmp_path), "cameras.bin", error=SceneError)
+
+
+def test_maps_with_a_picture_among_them_are_maps(tmp_path):
+    Image.new("RGB", (9, 6)).save(tmp_path / "preview.png")
+    np.save(tmp_path / "a.npy", torch.ones(6, 9, 8).numpy())
+    assert "1 feature maps by another program" in describe(tmp_path)
+
+
+def test_a_folder_with_nothing_that_is_known(tmp_path):
+    refused(lambda: describe(tmp_path), "expected a COLMAP model", error=SceneError)
