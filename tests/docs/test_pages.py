@@ -1,4 +1,4 @@
-"""The pages of the site as they are written: links lead somewhere, messages are those of the code, pictures are small."""
+"""The pages of the site as they are written: links lead somewhere, messages are those of the code, tests that are named exist."""
 
 import ast
 import re
@@ -58,6 +58,18 @@ def test_a_page_begins_with_the_question_that_it_answers(page):
     paragraph = first.split("\n\n")[0].replace("\n", " ")
     assert re.match(r"\*\*[^*]+", paragraph), paragraph[:80]
     assert "?" in paragraph, paragraph[:80]
+
+
+@pytest.mark.parametrize(("page", "least", "without"), [("promises.md", 11, 0), ("paper.md", 50, 5)])
+def test_a_table_of_tests_names_those_that_exist(page, least, without):
+    """Every row ends in tests or, as often as it is known, says that there is none and why."""
+    text = (DOCS / page).read_text(encoding="utf-8")
+    rows = [row for row in re.findall(r"^\| .+ \| (.+) \|$", text, re.MULTILINE) if row != "test"]
+    assert len(rows) >= least
+    assert sum(row.startswith("no test: ") for row in rows) == without == sum("::" not in row for row in rows)
+    for file, test in re.findall(r"`(tests/[^`]+)::(\w+)`", text):
+        tree = ast.parse((ROOT / file).read_text(encoding="utf-8"))
+        assert test in {node.name for node in tree.body if isinstance(node, ast.FunctionDef)}, f"{file} has no {test}"
 
 
 @cache
