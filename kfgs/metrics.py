@@ -1,4 +1,4 @@
-"""Scores with their definitions: mIoU, accuracy, cosine, PSNR, SSIM, and bytes.
+"""Scores with their definitions: mIoU, accuracy, PSNR, SSIM, and bytes.
 
 `kornia.metrics` compares pictures. What it leaves open is settled here: labels to ignore, pooling over views, classes
 that do not occur, and which SSIM.
@@ -15,10 +15,9 @@ import torch
 from torch import Tensor
 
 from ._check import as_tensor, check_range, check_shapes
-from ._rows import unit_rows
 from .cameras.resample import to_bchw
 
-__all__ = ["ConfusionMatrix", "feature_cosine", "psnr", "semantic_storage_bytes", "ssim"]
+__all__ = ["ConfusionMatrix", "psnr", "semantic_storage_bytes", "ssim"]
 
 MIB = 2**20
 """Bytes in the "MB" of Table 1."""
@@ -140,29 +139,6 @@ class ConfusionMatrix:
         return float(self._counts.diagonal().sum().double() / self._counts.sum())
 
 
-def feature_cosine(
-    features: Tensor,  # [..., D]
-    target: Tensor,  # [..., D]
-) -> Tensor:  # scalar
-    """Mean cosine between corresponding feature vectors.
-
-    Each vector is divided by max(|x|, 1e-8) (`unit_rows`), so an all-zero vector counts as cosine 0, on either side.
-    Half precision is computed in float32, where this epsilon does not become 0.
-
-    Raises:
-        ValueError: if shapes differ, or there is nothing to compare.
-
-    Example:
-        >>> feature_cosine(torch.tensor([[2.0, 0.0], [0.0, 0.0]]), torch.tensor([[3.0, 0.0], [1.0, 0.0]]))
-        tensor(0.5000)
-    """
-    features, target = _alike("features", features, target)
-    if features.numel() == 0:
-        raise ValueError(f"features: expected at least one vector, got {tuple(features.shape)}; compare something")
-    rows = [unit_rows(x.to(torch.promote_types(x.dtype, torch.float32))) for x in (features, target)]
-    return (rows[0] * rows[1]).sum(dim=-1).mean()
-
-
 def psnr(
     image: Tensor,  # [H, W, C]
     target: Tensor,  # [H, W, C]
@@ -202,18 +178,11 @@ def ssim(
     check_range("peak", peak, 0, closed=(False, False))
     if min(image.shape[:2]) < SSIM_WINDOW:
         raise ValueError(f"image: expected at least {SSIM_WINDOW} pixels on each side, got {tuple(image.shape)}")
-    similarity = kornia.metrics.ssim(
-        to_bchw(image), to_bchw(target), SSIM_WINDOW, max_val=float(peak), eps=0.0, padding="valid"
-    )
-    return similarity.mean()
+    pair = to_bchw(image), to_bchw(target)
+    return kornia.metrics.ssim(*pair, SSIM_WINDOW, max_val=float(peak), eps=0.0, padding="valid").mean()
 
 
-def semantic_storage_bytes(
-    gaussians: int,
-    channels: int,
-    decoder_parameters: int = 0,
-    codebook_values: int = 0,
-) -> int:
+def semantic_storage_bytes(gaussians: int, channels: int, decoder_parameters: int = 0, codebook_values: int = 0) -> int:
     """Bytes of a semantic field as the paper's Table 1 counts them; divide by `MIB` for its "MB".
 
     All in float32: per Gaussian 14 + d numbers (3 means, 3 normals that are always zero, opacity, 3 scales, 4 rotation,

@@ -149,12 +149,13 @@ semantic = cloud.replace(features=sums / weights.clamp_min(1e-6)[:, None], sh=No
 print(semantic, f"{float((weights > 0).float().mean()):.0%} of them seen")
 
 # %%
+from torch.nn.functional import cosine_similarity
+
 from kfgs import resize_map
-from kfgs.metrics import feature_cosine
 
 held = scene.cameras[train[apart]]
 rendering = rasterize(semantic, held)
-cosine = feature_cosine(resize_map(rendering.map, (h, w)), maps[apart])
+cosine = cosine_similarity(resize_map(rendering.map, (h, w)), maps[apart], dim=-1).mean()
 print(f"{tuple(rendering.map.shape)} rendered; cosine with the teacher on the view kept apart {float(cosine):.3f}")
 pictures = [scene.image(train[apart]), colors(maps[apart]), colors(rendering.map)]
 Image.fromarray(viz.picture_grid([pictures], ["photograph", "the teacher", "rendered features"], width=240))

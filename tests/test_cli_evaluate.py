@@ -48,7 +48,10 @@ def test_a_run_remembers_its_scene_and_its_score_is_the_protocols(run, words, as
     assert said == str(expected)
     kept = json.loads((tmp_path / "s.json").read_text())
     assert kept["scores"] == dict(expected.scores)
-    assert (kept["protocol"], kept["options"]) == ("kfgs-pooled/1", {"level": 0, "labels": "own"})
+    assert (kept["protocol"], kept["options"]) == (
+        "kfgs-pooled/1",
+        {"level": 0, "merged": [], "most": None, "labels": "own"},
+    )
     assert kept["machine"]
     assert kept["command"] == " ".join(typed)
 

@@ -7,7 +7,7 @@ from messages import refused
 from oracles_color import ssim_windows
 from oracles_metrics import segmentation_scores
 
-from kfgs.metrics import ConfusionMatrix, feature_cosine, psnr, ssim
+from kfgs.metrics import ConfusionMatrix, psnr, ssim
 
 
 def labels(low, high, shape, seed):
@@ -91,22 +91,6 @@ def test_label_refusals():
     refused(lambda: counts(good, torch.tensor([0, 255]), 2), "target:", "[0, 2)", "got 0 to 255", "`ignore`")
     refused(lambda: counts(torch.tensor([-2, 1]), good, 2), "pred:", "[0, 2)", "got -2 to 1", "-1 for none")
     refused(lambda: ConfusionMatrix(0), "classes:", "got 0")
-
-
-# features
-
-
-def test_cosine_in_closed_form():
-    a, b = torch.tensor([[3.0, 4.0], [1.0, 0.0]]), torch.tensor([[4.0, 3.0], [-2.0, 0.0]])
-    assert float(feature_cosine(a, b)) == pytest.approx((24 / 25 - 1) / 2)
-
-
-def test_zero_vector_counts_as_zero_and_never_nan():
-    features = torch.tensor([[1.0, 0.0], [0.0, 0.0], [0.0, 0.0]])
-    target = torch.tensor([[1.0, 0.0], [1.0, 0.0], [0.0, 0.0]])
-    assert float(feature_cosine(features, target)) == pytest.approx(1 / 3)
-    naive = (features * target).sum(-1) / (features.norm(dim=-1) * target.norm(dim=-1))
-    assert naive.isnan().any()  # the wrong reading
 
 
 # pictures

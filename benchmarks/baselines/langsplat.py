@@ -1,7 +1,8 @@
 """LangSplat (CVPR 2024): an autoencoder of the scene's features to 3 numbers, learnt by every Gaussian.
 
 A latent is divided by its length before it is splatted, so a rendered map lies inside the unit ball; it is not normalised again.
-Published are three levels from masks, each its own run; with features of pixels there is one.
+Published are three levels from masks, each its own run; with features of pixels there is one. So the paper's oracle, "the level
+with the highest IoU (for each category in every image)", has nothing to choose from here: it needs SAM's masks at three sizes.
 """
 
 from __future__ import annotations

@@ -9,6 +9,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -21,12 +22,12 @@ from ..scenes import Scene
 from .color import COLOR_PROTOCOL, score_views
 from .find import find_points
 from .method import LabelRule, Method, View, annotated, best_labels, check_level, label_view
-from .report import Report, Row, make_report
+from .report import Report, Row, make_report, mean
 from .segmentation import PROTOCOL, evaluate_segmentation
 from .surface import ABOUT, NAME, score_surface
 from .teacher_agreement import TeacherAgreement
 from .texts import Encode, encode_unit
-from .truth import LabelTruth, PointTruth, is_void
+from .truth import LabelTruth, Merged, PointTruth, is_void, merge_table
 from .views import label_views
 
 
@@ -42,17 +43,41 @@ class KfgsPooled:
 
     level: int = 0
     """The map of a method with several."""
+    merged: Merged = ()
+    """Pairs of names: the first class counts as the second, in truth and answer."""
+    most: int | None = None
+    """Average the IoU of this many classes, those with most true pixels (ties by name); None: of all that occur."""
 
     def score(self, method: Method, truth: LabelTruth, views: Sequence[View], encode: Encode) -> Report:
         """Segment each view that has a label picture."""
-        text = encode_unit(encode, truth.names)
-        cameras = {view.stem: view for view in annotated(views, truth.maps)}
+        text, cameras = encode_unit(encode, truth.names), {view.stem: view for view in annotated(views, truth.maps)}
+        answer = partial(label_view, method, text=text, level=self.level)
         scored = evaluate_segmentation(
-            lambda stem: label_view(method, cameras[stem], text, self.level).cpu(), truth.maps, truth.names
+            lambda stem: answer(cameras[stem]).cpu(), truth.maps, truth.names, merged=self.merged
         )
-        pairs = zip(scored.names, scored.iou.tolist(), strict=True)
-        rows: list[Row] = [{"class": name, "IoU": iou} for name, iou in pairs if iou == iou]
-        return make_report(self, method.name, {"mIoU": scored.miou.value, "accuracy": scored.accuracy.value}, rows)
+        pixels = (scored.confusion.sum(dim=1) + scored.misses).tolist()
+        chosen = [i for i, iou in enumerate(scored.iou.tolist()) if iou == iou]
+        if self.most is not None:
+            chosen = sorted((i for i in chosen if pixels[i]), key=lambda i: (-pixels[i], truth.names[i]))[: self.most]
+        rows: list[Row] = [{"class": truth.names[i], "IoU": float(scored.iou[i])} for i in chosen]
+        scores = {"mIoU": mean(float(scored.iou[i]) for i in chosen), "accuracy": scored.accuracy.value}
+        notes = [] if self.most is None else [f"classes: {', '.join(truth.names[i] for i in chosen)}"]
+        return make_report(self, method.name, scores, rows, notes)
+
+
+@dataclass(frozen=True)
+class DF3DGS(KfgsPooled):
+    """The paper's score (Sec. 4.1): "rugs" are floor, "class = 10". It lists neither merges nor classes: these are ours."""
+
+    name: ClassVar[str] = "df3dgs/1"
+    about: ClassVar[str] = (
+        "one confusion matrix over all views after merging (rug to floor), mean IoU of the ten classes with most true pixels "
+        "(ties by name); all classes are asked; accuracy over all pixels"
+    )
+    rule: ClassVar[LabelRule] = "paper"
+
+    merged: Merged = (("rugs", "floor"), ("rug", "floor"))
+    most: int | None = 10
 
 
 @dataclass(frozen=True)
@@ -67,6 +92,8 @@ class KfgsSurface:
 
     level: int = 0
     """The map of a method with several."""
+    merged: Merged = ()
+    """As in `KfgsPooled`."""
 
     @staticmethod
     def open(
@@ -92,7 +119,8 @@ class KfgsSurface:
                 target[same] = names.index(name)
             elif bool(same.any()):
                 left_out.append(f"{name} ({int(same.sum())} points)")
-        scored = score_surface(method.gaussians.means, best_labels(cosines), points, target)
+        table = merge_table(names, self.merged).to(target.device)
+        scored = score_surface(method.gaussians.means, table[best_labels(cosines)], points, table[target])
         notes = [f"not scored, no class: {', '.join(left_out)}"] if left_out else []
         return make_report(self, method.name, scored.scores, scored.rows, notes)
 
@@ -125,7 +153,7 @@ class KfgsColor:
         return make_report(self, "", {"PSNR": scored.psnr.value, "SSIM": scored.ssim.value}, rows)
 
 
-PROTOCOLS: dict[str, Any] = {kind.name: kind for kind in (KfgsPooled, KfgsSurface, KfgsColor, TeacherAgreement)}
+PROTOCOLS: dict[str, Any] = {kind.name: kind for kind in (KfgsPooled, DF3DGS, KfgsSurface, KfgsColor, TeacherAgreement)}
 """The protocols by name; see docs/protocols.md."""
 
 

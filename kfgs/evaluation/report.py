@@ -90,16 +90,7 @@ def make_report(
     options = {option.name: plain(getattr(protocol, option.name)) for option in fields(protocol)}
     usual = type(protocol)()
     changed = tuple(name for name in options if getattr(protocol, name) != getattr(usual, name))
-    return Report(
-        protocol=protocol.name,
-        scores=dict(scores),
-        rows=tuple(rows),
-        method=method,
-        about=protocol.about,
-        options=options,
-        changed=changed,
-        notes=tuple(notes),
-    )
+    return Report(protocol.name, dict(scores), tuple(rows), method, protocol.about, options, changed, tuple(notes))
 
 
 def mean(values: Iterable[float]) -> float:

@@ -14,6 +14,7 @@ from .._check import as_tensor
 from ..cameras.resample import resize_labels
 from ..metrics import ConfusionMatrix, Score
 from .label_pictures import load_label_map
+from .truth import Merged, merge_table
 
 PROTOCOL = (
     "kfgs-pooled/1: one confusion matrix over all views, mean IoU over the classes that occur in truth or prediction, "
@@ -67,6 +68,8 @@ def evaluate_segmentation(
     predict: Any,  # stem -> labels [h, w]: a mapping, a function or a field
     truth: Mapping[str, Path | Tensor],  # stem -> label picture, or its labels [H, W] with -1 = void
     names: Any,
+    *,
+    merged: Merged = (),
 ) -> SegmentationReport:
     """Score predicted label maps against label pictures (protocol `kfgs-pooled/1`).
 
@@ -75,6 +78,7 @@ def evaluate_segmentation(
             A field segments its own views; for others, `lambda stem: field.segment(scene[stem])`.
         truth: one label picture, or array, per view.
         names: class names, or what has them (a label set); a label is an index into them.
+        merged: pairs of names: the first class counts as the second, in truth and prediction.
 
     Raises:
         ValueError: if there is nothing to score, or a truth label has no name.
@@ -83,7 +87,7 @@ def evaluate_segmentation(
     if not truth:
         raise ValueError("truth: expected at least one label picture, got none; is the folder of labels right?")
     answer = getattr(predict, "get" if isinstance(predict, Mapping) else "segment", predict)
-    pooled = ConfusionMatrix(len(names))
+    pooled, table = ConfusionMatrix(len(names)), merge_table(names, merged)
     for stem, given in truth.items():
         place = str(given) if isinstance(given, str | Path) else f"truth[{stem!r}]"
         target = load_label_map(given) if isinstance(given, str | Path) else as_tensor(place, given)
@@ -91,7 +95,7 @@ def evaluate_segmentation(
         labels = as_tensor(f"predict({stem!r})", answer(stem))
         if labels.shape != target.shape:
             labels = resize_labels(labels, (int(target.shape[0]), int(target.shape[1])))
-        pooled.update(labels, target)
+        pooled.update(table.to(labels.device)[labels.long()], table.to(target.device)[target.long()])
     if int(pooled.matrix.sum() + pooled.misses.sum()) == 0:
         raise ValueError(f"truth: expected some pixel with a known label, got only void in {len(truth)} views")
     return SegmentationReport(

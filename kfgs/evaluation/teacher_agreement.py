@@ -15,9 +15,9 @@ from ..scenes.files import natural_key
 from .method import LabelRule, Method, View, label_view
 from .report import Report, Row, make_report, mean
 from .texts import Encode, encode_unit
+from .truth import Merged, merge_table
 
-MERGED = ((89, 14), (28, 3), (57, 39))
-"""ADE20K's classes that become others: television to door, rug to floor, pillow to cushion."""
+MERGED = (("television", "door"), ("rug", "floor"), ("pillow", "cushion"))  # of ADE20K's words
 LARGEST = (360, 480)  # (height, width): wider views are scored at this size
 SIZE = (119, 159)  # (height, width) to which both label maps are brought, "as in the NeRF baseline"
 MOST = 7  # classes whose IoU is averaged
@@ -75,6 +75,8 @@ class TeacherAgreement:
     """Of the views sorted by the numbers in their names, every 8th from index 2. None: all views that are given."""
     level: int = 0
     """The map of a method with several."""
+    merged: Merged | None = None
+    """As in `KfgsPooled`. None: those of `MERGED` with the published texts, else none."""
 
     def score(self, method: Method, truth: Method, views: Sequence[View], encode: Encode) -> Report:
         """Compare a method with its teacher, the method `truth`; `split` chooses some of the views.
@@ -83,13 +85,15 @@ class TeacherAgreement:
             ValueError: if the split holds no view.
         """
         chosen = self.chosen(views)
-        text = encode_unit(encode, ade20k_words() if self.texts is None else self.texts)
+        words, usual = (ade20k_words(), MERGED) if self.texts is None else (self.texts, ())
+        text, table = encode_unit(encode, words), merge_table(words, usual if self.merged is None else self.merged)
         rows: list[Row] = []
         for view in chosen:
             if view.camera.width > LARGEST[1]:
                 view = view._replace(camera=view.camera.resized(*LARGEST))
-            taught = self._as_scored(label_view(truth, view, text).cpu())
-            accuracy, iou = teacher_agreement(taught, self._as_scored(label_view(method, view, text, self.level).cpu()))
+            pair = label_view(truth, view, text), label_view(method, view, text, self.level)
+            taught, said = (_as_scored(table[labels.cpu()]) for labels in pair)
+            accuracy, iou = teacher_agreement(taught, said)
             rows.append({"view": view.stem, "mIoU": iou, "accuracy": accuracy})
         scores = {name: mean(row[name] for row in rows) for name in ("mIoU", "accuracy")}
         step, first = self.split or (1, 0)
@@ -98,13 +102,6 @@ class TeacherAgreement:
             "in their names"
         )
         return make_report(self, method.name, scores, rows, [note] if self.split else [])
-
-    def _as_scored(self, labels: Tensor) -> Tensor:  # [H, W] -> SIZE
-        """Labels with merged classes, resized as torch's "nearest" does: row i reads row floor(i H / h)."""
-        for old, new in MERGED if self.texts is None else ():
-            labels = labels.where(labels != old, new)
-        rows, columns = (torch.arange(new) * old // new for new, old in zip(SIZE, labels.shape, strict=True))
-        return labels[rows[:, None], columns]
 
     def chosen(self, views: Sequence[View]) -> list[View]:
         """The views of `split`, sorted by the numbers in their names.
@@ -117,6 +114,12 @@ class TeacherAgreement:
         if not chosen:
             raise ValueError(f"views: expected more than {first}, got {len(views)}; pass split=None")
         return chosen
+
+
+def _as_scored(labels: Tensor) -> Tensor:  # [H, W] -> SIZE
+    """Labels resized as torch's "nearest" does: row i reads row floor(i H / h)."""
+    rows, columns = (torch.arange(new) * old // new for new, old in zip(SIZE, labels.shape, strict=True))
+    return labels[rows[:, None], columns]
 
 
 def ade20k_words() -> list[str]:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
+import torch
 from torch import Tensor
 
 from .._card import short_repr
@@ -14,6 +15,8 @@ from .._check import ORIGIN, check_shapes
 from .._origin import choose_origin
 
 T = TypeVar("T")
+Merged = tuple[tuple[str, str], ...]
+"""Pairs of names: in truth and answers, the first class counts as the second. All names are asked."""
 VOID_NAMES = ("void", "unlabeled", "unlabelled", "unknown", "ignore")
 """Names that mean "no class". Their pixels and points are not scored."""
 
@@ -69,6 +72,12 @@ class ReadWhenAsked(Mapping[str, T]):
 
     def __len__(self) -> int:
         return len(self._readers)
+
+
+def merge_table(names: Sequence[str], merged: Merged) -> Tensor:  # [C + 1] int64
+    """The class that each class counts as, itself by default; -1 at the end, so that `table[labels]` keeps it."""
+    becomes = {old: list(names).index(new) for old, new in merged if new in names}
+    return torch.tensor([*(becomes.get(name, i) for i, name in enumerate(names)), -1])
 
 
 def name_key(name: str) -> str:

@@ -10,9 +10,7 @@ def test_texts_and_merges_are_the_published_ones():
     words = ade20k_words()
     assert len(words) == 150
     assert [i for i, name in enumerate(words, 1) if name == "screen"] == [59, 131]
-    assert [(words[old], words[new]) for old, new in MERGED] == [
-        ("television", "door"), ("rug", "floor"), ("pillow", "cushion"),
-    ]  # fmt: skip
+    assert [(words.index(old), words.index(new)) for old, new in MERGED] == [(89, 14), (28, 3), (57, 39)]
 
 
 def agreement(teacher, student, most=7):
@@ -58,7 +56,7 @@ def test_the_whole_protocol_against_loops():
         maps = []
         for method in (teacher, student):
             labels = np.argmax([method.maps[stem][text][0] for text in words], axis=0)
-            for old, new in MERGED:
+            for old, new in ((89, 14), (28, 3), (57, 39)):
                 labels[labels == old] = new
             rows, columns = np.arange(SIZE[0]) * 24 // SIZE[0], np.arange(SIZE[1]) * 32 // SIZE[1]
             maps.append(labels[np.ix_(rows, columns)])
