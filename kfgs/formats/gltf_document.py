@@ -18,8 +18,8 @@ from urllib.parse import unquote, urlsplit
 
 import numpy as np
 import torch
+from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from .._files import atomic_path, parse_json, real_path
@@ -129,7 +129,7 @@ def _matrix(node: dict[str, Any]) -> Tensor:  # [4, 4] float64
     if not 0.99 < math.hypot(*xyzw.tolist()) < 1.01:
         raise ValueError(f"a node's rotation is not a unit quaternion x, y, z, w: {xyzw.tolist()}")
     local = torch.eye(4, dtype=torch.float64)
-    local[:3, :3] = torch.from_numpy(Rotation.from_quat(xyzw.tolist()).as_matrix()) * numbers("scale", [1.0] * 3)
+    local[:3, :3] = quaternion_to_rotation_matrix(xyzw.roll(1)) * numbers("scale", [1.0] * 3)
     local[:3, 3] = numbers("translation", [0.0] * 3)
     return local
 

@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from scipy.spatial.transform import Rotation
+from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from torch import Tensor
 
 from .._card import cut
@@ -176,8 +176,8 @@ class _Motion(OnSelection):
         if self.rotation is not None:
             axis = torch.tensor(self.rotation[0], dtype=torch.float64)
             axis = axis / axis.abs().max()  # no overflow
-            vector = math.fmod(self.rotation[1], 360) * axis / axis.norm()
-            R = torch.from_numpy(Rotation.from_rotvec(vector.numpy(), degrees=True).as_matrix())
+            vector = math.radians(math.fmod(self.rotation[1], 360)) * axis / axis.norm()
+            R = axis_angle_to_rotation_matrix(vector[None])[0]
         if isinstance(self.pivot, tuple):
             pivot = torch.tensor(self.pivot, dtype=torch.float64)
         else:

@@ -17,6 +17,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
+from kornia.geometry.conversions import camtoworld_graphics_to_vision_4x4
 from torch import Tensor
 
 from .._files import Names, file_stem, read_json
@@ -34,7 +36,6 @@ _LENSES = {  # the coefficients that each camera_model has
 }
 _COEFFICIENTS = _LENSES["FULL_OPENCV"]
 _NUMBERS = ("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y", *_COEFFICIENTS)
-FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL axes to COLMAP's
 _UNNAMED_POINTS = "points3d.ply"  # 3DGS and OpenGaussian write it
 
 
@@ -125,8 +126,7 @@ class Frame:
         except (TypeError, ValueError, OverflowError) as error:
             advice = "correct it, or take the frame out"
             raise self.fail("transform_matrix", "4 rows of 4 numbers", rows, advice) from error
-        pose[:3] = pose[:3] @ FLIP
-        return pose
+        return camtoworld_graphics_to_vision_4x4(torch.from_numpy(pose)[None])[0].numpy()  # OpenGL axes to COLMAP's
 
 
 @dataclass
