@@ -212,8 +212,7 @@ def folder_masks(
     folder, files = next(((place, files) for place in places if (files := list_images(place))), (pictures, []))
     if not files:
         return None, []
-    known = Names(files)
-    chosen = known.find_each(names)
+    chosen = Names(files).find_each(names)
     masks = [None if file is None else folder / file for file in chosen]
     taken = set(chosen) - {None}
     extra = [file for file in files if file not in taken]

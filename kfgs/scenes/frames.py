@@ -263,8 +263,7 @@ def _drift(a: Array, b: Array) -> float:
         turn, factor = Rotation.from_rotvec(x[:3]).as_matrix(), float(np.exp(np.clip(x[6], -0.1, 0.1)))
         t = factor * turn @ (t - center) + center + x[3:6]
         R, s = Rotation.from_matrix(turn @ R).as_matrix(), s * factor
-    shift = s * a @ R.T + t - a
-    return float(np.quantile(np.abs((shift * m).sum(1)), DRIFT_SHARE))
+    return float(np.quantile(np.abs(((s * a @ R.T + t - a) * m).sum(1)), DRIFT_SHARE))
 
 
 def _with_normals(points: Array) -> tuple[Array, Array, Any]:

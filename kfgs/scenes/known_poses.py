@@ -102,12 +102,8 @@ def _reconstruction(pycolmap: Any, scene: Scene, names: list[str]) -> Any:
     """The views as pycolmap has them, each with its own camera."""
     known = pycolmap.Reconstruction()
     for i, (lens, name) in enumerate(zip(scene.lenses or scene.cameras, names, strict=True), 1):
-        bent = [] if lens.distortion is None else [*lens.distortion.coefficients]
-        model = {0: "PINHOLE", 4: "OPENCV"}.get(len(bent), "FULL_OPENCV")
-        if lens.distortion is not None and lens.distortion.model == "kannala_brandt":
-            model = "OPENCV_FISHEYE"
-        bent += [0.0] * (8 - len(bent) if model == "FULL_OPENCV" else 0)
-        params = [*lens.K[[0, 1, 0, 1], [0, 1, 2, 2]].tolist(), *bent]
+        params = lens.model.params.tolist()  # kornia's models have COLMAP's order of parameters
+        model = {4: "PINHOLE", 8: "OPENCV_FISHEYE", 12: "FULL_OPENCV"}[len(params)]
         camera = pycolmap.Camera(model=model, width=lens.width, height=lens.height, params=params, camera_id=i)
         camera.has_prior_focal_length = True
         known.add_camera_with_trivial_rig(camera)

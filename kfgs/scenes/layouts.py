@@ -35,8 +35,7 @@ def load_nice_slam(folder: Path) -> Scene:
     try:
         width, height, fx, fy, scale, cx, cy = values = [top["camera"][name] for name in names]
         numbers = all(type(value) in (int, float) and abs(value) < MAX_NUMBER for value in values)  # NaN fails
-        whole = numbers and width % 1 == height % 1 == 0
-        if not (whole and min(values[:5]) > 0 and max(width, height) <= MAX_SIDE):
+        if not (numbers and width % 1 == height % 1 == 0 and min(values[:5]) > 0 and max(width, height) <= MAX_SIDE):
             raise ValueError(f"{values}")
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         expected = f"a 'camera' with {', '.join(names)} (the scale of the depth pictures) as positive numbers"

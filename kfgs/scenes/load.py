@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import shlex
+import tempfile
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from .._check import check_choice
 from .._files import as_path, real_path
@@ -28,7 +29,7 @@ SplitChoice = Literal["auto", "df3dgs", "feature3dgs", "holdout8", "all"]
 
 
 def load_scene(
-    path: str | Path, *, images: str | Path | None = None, split: SplitChoice = "auto", strict: bool = False
+    path: Any, *, images: str | Path | None = None, split: SplitChoice = "auto", strict: bool = False
 ) -> Scene:
     """Open a folder with pictures and their poses, in the layout of COLMAP, nerfstudio, Replica or ScanNet.
 
@@ -37,7 +38,7 @@ def load_scene(
     Blender's `transforms_train.json`; Replica as NICE-SLAM or Semantic-NeRF rendered it; ScanNet.
 
     Args:
-        path: the scene folder, a model folder, or a .json file.
+        path: the scene folder, a model folder, or a .json file; or a `pycolmap.Reconstruction`, which needs `images`.
         images: the image folder, also by its name in the scene folder; cameras are resized to its pictures. None: `images/`
             next to the model or above it, else the first of `images_2`, `images_4`, ..., else the scene folder.
         split: `"auto"`: split.json, else lists of names (`test.txt`, `train_list.txt`, ...), else the split of the
@@ -54,6 +55,12 @@ def load_scene(
         SceneError: if there is no scene, or it cannot be used.
         ValueError: if `split` is unknown.
     """
+    if hasattr(path, "points3D"):  # a reconstruction; what COLMAP can write is read, with all checks
+        if images is None:
+            raise ValueError("images: expected the folder of the pictures of a Reconstruction, got None; pass it")
+        with tempfile.TemporaryDirectory() as written:
+            path.write(written)
+            return replace(load_scene(written, images=images, split=split, strict=strict), folder=None)
     path = as_path(path)
     check_choice("split", split, ("auto", *RULES))
     if not path.exists():

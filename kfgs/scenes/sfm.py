@@ -107,10 +107,9 @@ def run_sfm(
     stems = {file_stem(name) for name in names}  # of converted ones, too
     heic = [name for name in list_images(images, (".heic", ".heif")) if file_stem(name) not in stems]
     if heic:
-        raise SceneError(
-            f"{images}: expected pictures that pycolmap reads, got HEIC photographs ({some(heic, 3)}); save them as JPEG, with "
-            "their EXIF: `magick mogrify -format jpg *.heic`, in the app of the phone, or in its settings before the next photo"
-        )
+        how = "`magick mogrify -format jpg *.heic`, in the app of the phone, or in its settings before the next photo"
+        got = f"HEIC photographs ({some(heic, 3)}); save them as JPEG, with their EXIF: {how}"
+        raise SceneError(f"{images}: expected pictures that pycolmap reads, got {got}")
     if len(names) < 3:
         raise SceneError(f"{images}: expected at least 3 images (PNG, JPEG, TIFF, WebP), got {len(names)}; add views")
     pairs = None if config.matching == "exhaustive" else sequential_pairs(names)
@@ -201,10 +200,9 @@ class SfmRun:
                     camera.setdefault("existing_camera_id", int(placed[0]))
                 self.bar.update(len(few))
         if len(ids) < min(3, len(names)):
-            raise SceneError(
-                f"{self.images}: expected at least 3 images that can be decoded, got {len(ids)} of {len(names)}; not "
-                f"{some([name for name in names if name not in ids], 3)}: save them again as PNG or JPEG"
-            )
+            lost = some([name for name in names if name not in ids], 3)
+            got = f"{len(ids)} of {len(names)}; not {lost}: save them again as PNG or JPEG"
+            raise SceneError(f"{self.images}: expected at least 3 images that can be decoded, got {got}")
 
     def match(self, pairs: Sequence[tuple[str, str]] | None = None) -> None:
         """Compare pairs of images, whose names may have no blank; None: each with each."""

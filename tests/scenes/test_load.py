@@ -3,6 +3,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+import pycolmap
 import pytest
 import torch
 from colmap_models import write_model, write_picture
@@ -24,6 +25,16 @@ def test_models_are_found_where_programs_put_them(tmp_path: Path, where: str) ->
     assert [c.name for c in scene.cameras] == ["a.png", "b.png"]
     assert scene.splits == {"train": [0, 1], "test": []}
     assert scene.notes == ("split all: 2 of 2 views train, 0 test",)
+
+
+def test_a_reconstruction_of_pycolmap_is_a_scene(tmp_path: Path) -> None:
+    model = write_model(tmp_path / "sparse/0", ["a.png", "b.png"])
+    _pictures(tmp_path / "images", ["a.png", "b.png"])
+    made = pycolmap.Reconstruction(model)
+    scene, same = load_scene(made, images=tmp_path / "images"), load_scene(tmp_path)
+    assert _facts(scene.cameras) == _facts(same.cameras)
+    assert (scene.points.tolist(), scene.folder) == (same.points.tolist(), None)
+    refused(lambda: load_scene(made), "images:", "Reconstruction", "got None")
 
 
 def test_a_model_folder_or_a_given_image_folder_will_do(tmp_path: Path) -> None:
