@@ -71,8 +71,7 @@ class FieldOptimizer:
         if name == "means":
             assert self._training.extent is not None
             return rates.means ** (1 - t) * rates.means_final**t * self._training.extent
-        own: float = getattr(rates, name)
-        return own * rates.final ** max(0.0, 2 * t - 1)
+        return float(getattr(rates, name)) * rates.final ** max(0.0, 2 * t - 1)
 
     def step_(self, step: int) -> None:
         """Apply the gradients of step number `step`, then forget them."""

@@ -15,7 +15,7 @@ from .._check import check_shapes
 from .._files import atomic_path
 from .._rows import ENCODE, EPS, check_directions, row_norms, unit_rows
 from ..cameras import Camera
-from ..cameras.resample import from_bchw, to_bchw
+from ..cameras.resample import check_layout, from_bchw, to_bchw
 from ..quant.linear import LinearLatents, principal_directions
 from ..quant.maps import FeatureMaps, all_zero, read_blocks, read_grid
 
@@ -98,6 +98,7 @@ class WorkingMaps:
             parts.append((features @ self.directions) / lengths.clamp_min(EPS)[..., None] * masks[-1])
         rows, known = torch.cat(parts), torch.cat(masks)
         height, width = rows.shape[:2]
+        check_layout(f"maps[{i}]", (height, width, len(self.directions)), self._cameras[i].size)
         if (shrink := self._shrinkage(height, width)) > 1:
             rows, share = shrink_map(rows, shrink), shrink_map(known.to(rows), shrink)
             rows, known = rows / share.clamp_min(EPS), share > 0.5

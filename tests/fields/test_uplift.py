@@ -416,6 +416,7 @@ FOUR = random_maps(cameras())
         ({"gaussians": cloud().select(slice(0, 0))}, ("gaussians:", "got none")),
         ({"maps": [FOUR[0], torch.ones(10, 13, 7), *FOUR[2:]]}, ("maps[1]:", "5]", "7)")),
         ({"maps": [torch.ones(4, 5)] * 4}, ("maps[0]:", "[h, w, D]", "got (4, 5)")),
+        ({"maps": [torch.ones(3, 10, 13)] * 4}, ("maps[0]:", "[h, w, D]", "got (3, 10, 13)", "from_bchw")),
         ({"maps": [*FOUR[:3], FOUR[3].masked_fill(FOUR[3] == FOUR[3][0, 0, 0], torch.nan)]}, ("maps[3]:", "got NaN")),
         ({"maps": [*FOUR[:3], FOUR[3].masked_fill(FOUR[3] == FOUR[3][0, 0, 0], torch.inf)]}, ("maps[3]:", "got NaN")),
         ({"maps": [torch.zeros(5, 6, 3)] * 4}, ("maps:", "zero", "got 4")),
