@@ -103,7 +103,7 @@ def kfgs_config(row: Row, key: str, preset: str, steps: int | None) -> Uplift | 
     """
     if row.mode is None:
         return Uplift()  # nothing is trained
-    method = Paper() if row.own else Paper.paper()
+    method = Paper.grown() if row.own else Paper()
     training = Training() if preset == "paper" else Training.cpu()
     steps = QUICK_STEPS[key] if preset == "quick" and steps is None else steps
     method = replace(method, training=training if steps is None else training.with_steps(steps))

@@ -22,7 +22,6 @@ from table1_rows import FPS_VIEWS, QUICK_STEPS, Room, field_codec, fitting_secon
 
 from kfgs._files import atomic_path, digest_value, read_json, write_json
 from kfgs.evaluation import FieldMethod
-from kfgs.fields import Training
 from kfgs.metrics import MIB
 from kfgs.pipeline import Paper, fit
 from kfgs.viz.plots import finish, new_figure
@@ -36,7 +35,7 @@ PAPER = {  # mIoU, minutes, thousand Gaussians, MB, FPS
 
 def config_of(dim: int, args: argparse.Namespace) -> Paper:
     """Of one row: `adc+sc` with so many latents, or `adc`."""
-    method = Paper.paper() if args.preset == "paper" else Paper.paper(training=Training.cpu())
+    method = Paper.paper() if args.preset == "paper" else Paper()
     latents = None if dim == FULL else replace(method.autoencoder, latent=dim)
     steps = args.steps or (QUICK_STEPS["adc" if dim == FULL else "adc+sc"] if args.quick else None)
     training = method.training if steps is None else method.training.with_steps(steps)

@@ -149,7 +149,7 @@ def test_a_wrong_choice_is_told_the_words_that_can_be_given(capsys, monkeypatch)
     assert stop.value.code == 2
     said = capsys.readouterr()
     told = re.search(r"Expected one of \((.*?)\)", said.out + said.err)
-    assert re.findall(r"'(.*?)'", told[1]) == ["uplift", "paper", "paper-full", "adc", "decouple"]
+    assert re.findall(r"'(.*?)'", told[1]) == ["uplift", "paper", "paper-full", "grown", "adc", "decouple"]
 
 
 @pytest.mark.parametrize("flags", [(), ("-OO",)])

@@ -20,7 +20,7 @@ from .options import Flag, Given, Positional, SceneFolder, Settings, Teacher, Vi
 
 PICTURES = 4  # held-out views that `kfgs color` draws
 Workers = Annotated[str | None, tyro.conf.arg(metavar="NUMBER|ADDRESS", help_behavior_hint="")]
-Method = Literal["uplift", "paper", "paper-full", "adc", "decouple"]
+Method = Literal["uplift", "paper", "paper-full", "grown", "adc", "decouple"]
 
 
 def demo(out: Path = Path("kfgs_demo")) -> None:
@@ -137,8 +137,8 @@ def fit(
         features: Folder of maps by `kfgs features` or another program; SCENE/features when not given.
         splat: Any splat of the scene, in its frame: the Gaussians to average onto. A file, or the output folder of 3DGS.
         method: uplift: average the features in 3-D, then compress. paper: compress each map, then train Gaussians on it
-            (DF-3DGS) in minutes on two cores; paper-full: with the published 30,000 steps; adc: without the autoencoder;
-            decouple: on the raw features.
+            (DF-3DGS), with its codebook and autoencoder and 2,000 steps; paper-full: with its 30,000; grown: with kfgs's own
+            codebook; adc: without the autoencoder; decouple: on the raw features.
     """
     from ..pipeline.run_report import write_run_report
     from ..scenes.load import scene_root
@@ -147,7 +147,7 @@ def fit(
         raise ValueError(f"splat: expected none with --method {method}, which trains its own Gaussians, got {splat}")
     made_by: Any = kfgs.Uplift(splat)
     if method != "uplift":
-        paper: Any = kfgs.Paper.paper() if method == "paper-full" else kfgs.Paper()
+        paper: Any = {"paper-full": kfgs.Paper.paper, "grown": kfgs.Paper.grown}.get(method, kfgs.Paper)()
         left_out = {"decouple": ("codebook", "autoencoder"), "adc": ("autoencoder",)}.get(method, ())
         made_by = replace(paper, **dict.fromkeys(left_out))
     made_by = settings.of(made_by)

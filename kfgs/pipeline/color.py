@@ -95,19 +95,16 @@ class TrainingPictures(Sequence[Tensor]):
 
     def __getitem__(self, i: int) -> Tensor:  # type: ignore[override]  # [h, w, 3 or 4], one picture at a time
         if i not in self._kept:
-            self._kept[i] = self._read(i)
-        bytes_, known = self._kept[i]
+            view, size = self._views[i], self._sizes[i]
+            picture, known, alpha = self._scene.image(view), self._scene.mask(view), self._scene.alpha(view)
+            if alpha is not None:
+                picture = torch.cat([picture, alpha[..., None]], dim=2)
+            bytes_ = (resize_map(picture, size, antialias=True).clamp(0, 1) * 255).round().to(torch.uint8)
+            inside = resize_map(known.float()[..., None], size, antialias=True)[..., 0]
+            self._kept[i] = bytes_, None if bool(known.all()) else inside > 1 - 1e-4
+        bytes_, counts = self._kept[i]
         picture = bytes_.float() / 255
-        return picture if known is None else picture.masked_fill(~known[..., None], torch.nan)
-
-    def _read(self, i: int) -> tuple[Tensor, Tensor | None]:  # [h, w, 3 or 4] uint8, [h, w] bool
-        view, size = self._views[i], self._sizes[i]
-        picture, known, alpha = self._scene.image(view), self._scene.mask(view), self._scene.alpha(view)
-        if alpha is not None:
-            picture = torch.cat([picture, alpha[..., None]], dim=2)
-        bytes_ = (resize_map(picture, size, antialias=True).clamp(0, 1) * 255).round().to(torch.uint8)
-        inside = resize_map(known.float()[..., None], size, antialias=True)[..., 0]
-        return bytes_, None if bool(known.all()) else inside > 1 - 1e-4
+        return picture if counts is None else picture.masked_fill(~counts[..., None], torch.nan)
 
 
 def fit_color(

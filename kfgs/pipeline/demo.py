@@ -7,15 +7,13 @@ from pathlib import Path
 from typing import Any
 
 from .._files import check_output, write_json
-from ..evaluation import Report, find_points, score_views
+from ..evaluation import find_points, score_views
 from ..evaluation.surface import score_surface
-from ..fields import SemanticField
 from ..fields.store import NAME
 from ..formats import write_splats
 from ..formats.ply import write_ply
-from ..gaussians import Gaussians
 from ..labels import EditList, OfClass, Recolor, Remove, connected_parts
-from ..scenes import FeatureFolder, Scene, load_scene
+from ..scenes import FeatureFolder, load_scene
 from ..toy.room_folder import ToyConfig, make_toy_room
 from ..viz.compare import views_of_change, write_comparison
 from .attach import attach, label_cloud, save_labelled
@@ -80,41 +78,28 @@ def run(
     say(f"the 2-D network alone, on the same views: {teacher.miou}")
     gaussians = field.label(classes)
     written = save_labelled(out / "gaussians.ply", gaussians, rule="fused features; score = cosine")
-    surface = _label_surface(folder, gaussians, out / "surface.ply")
+    known = find_points(folder)
+    write_ply(out / "surface.ply", {name: known.points[:, i].float().numpy() for i, name in enumerate("xyz")})
+    label_cloud(gaussians, out / "surface.ply", out / "surface.ply")
+    assert gaussians.labels is not None
+    surface = score_surface(gaussians.means, gaussians.labels, known.points.float(), known.labels)
     say(f"surface points: {surface}")
     say(
         f'5. Edits. The classes are carried over to the splat with the colours, and then "{REMOVED}" is a name for Gaussians: '
         f"the {REMOVED}s are removed, and the {PAINTED}s are painted red. What nobody saw behind a {REMOVED} is invented: the "
         "floor around it continues (fill). Pictures show the views that change most."
     )
-    edited = _edit_colors(out, scene, field, colors, say)
+    before = attach(field, colors).gaussians
+    edited = list(write_splats(before, out / "color.ply").paths)
+    for part in connected_parts(before, OfClass(REMOVED).select(before), field.cameras):
+        say(f"  {REMOVED}: {part!r}")
+    for name, edit in {"removed": Remove(REMOVED, fill=True), "recolored": Recolor(PAINTED, PAINT)}.items():
+        after, file = edit.apply(before), out / f"{name}.ply"
+        edited += [*write_splats(after, file).paths, EditList((edit,)).save(out / f"{name}.ply.edits.json")]
+        views = [scene.cameras[i] for i in views_of_change(before, after, scene.cameras)]
+        edited.append(write_comparison(out / f"{name}.png", before, after, views))
     reports: dict[str, Any] = {"unseen_views": scores, "teacher": teacher, "surface": surface, "color": quality}
     write_json(out / "scores.json", {name: value.to_json() for name, value in reports.items()})
     pages = write_run_report(out / "run", field, scene, method, command="kfgs demo")
     segmented = [out / "segmentation" / name for name in ("predicted", "colored", "sheets")]
     return [out / "run" / NAME, *segmented, *written, out / "surface.ply", *pages, *edited, out / "scores.json"]
-
-
-def _label_surface(room: Path, gaussians: Gaussians, cloud: Path) -> Report:
-    """Write points of the room's true surface with the labels carried to them, and score these (`kfgs-surface/1`)."""
-    known = find_points(room)
-    write_ply(cloud, {name: known.points[:, i].float().numpy() for i, name in enumerate("xyz")})
-    label_cloud(gaussians, cloud, cloud)
-    assert gaussians.labels is not None
-    return score_surface(gaussians.means, gaussians.labels, known.points.float(), known.labels)
-
-
-def _edit_colors(
-    out: Path, scene: Scene, field: SemanticField, colors: Gaussians, say: Callable[[str], None]
-) -> list[Path]:
-    """Attach the classes to the colours, remove the chairs and recolour the plants; returns the files."""
-    before = attach(field, colors).gaussians
-    written = write_splats(before, out / "color.ply").paths
-    for part in connected_parts(before, OfClass(REMOVED).select(before), field.cameras):
-        say(f"  {REMOVED}: {part!r}")
-    for name, edit in {"removed": Remove(REMOVED, fill=True), "recolored": Recolor(PAINTED, PAINT)}.items():
-        after, file = edit.apply(before), out / f"{name}.ply"
-        written += [*write_splats(after, file).paths, EditList((edit,)).save(out / f"{name}.ply.edits.json")]
-        views = [scene.cameras[i] for i in views_of_change(before, after, scene.cameras)]
-        written.append(write_comparison(out / f"{name}.png", before, after, views))
-    return written

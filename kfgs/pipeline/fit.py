@@ -1,7 +1,6 @@
 """Make a semantic field from posed images and teacher maps: fuse in 3-D, then compress; or the paper's Figure 2.
 
-Each step is a stage in the run folder and is found again by the digest of its inputs. Training also resumes from its last
-checkpoint.
+Each step is a stage in the run folder, found again by the digest of its inputs. Training resumes from its last checkpoint.
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ from ..scenes import FeatureFolder, Scene, extract_features
 from ..scenes.scene import as_taken
 from .color import color_stage, find_color
 from .maps import KnownFeatures, as_maps, describe_maps, map_shape, maps_of_views
-from .methods import Paper, Uplift
+from .methods import Paper, Uplift, changes
 from .stages import LOCK, Run, Stage, digest_cameras, digest_scene, digest_shape
 from .train import field_stage, stage_gaussians, training_device, training_views, with_extent, with_points
 
@@ -68,8 +67,9 @@ def fit(
         progress: True shows bars; a function receives the history rows of every trained stage as they appear.
 
     Returns:
-        The field, on the CPU; its `info` says how it was made, with the seconds of each stage. Training takes place on the
-        GPU if there is one (`CUDA_VISIBLE_DEVICES=""` hides it).
+        The field, on the CPU; its `info` says how it was made, with the seconds of each stage, and of the paper's method
+        which options are not the paper's. Codebook, index maps, autoencoder and training are computed on the GPU if there is
+        one (`CUDA_VISIBLE_DEVICES=""` hides it).
 
     Raises:
         TypeError: if `maps` are neither maps nor a teacher, or `method` is neither.
@@ -192,19 +192,20 @@ def _paper(
     """Codebook, index maps, autoencoder, Gaussians trained on the latent maps, and what the views show of each Gaussian."""
     targets: Sequence[Tensor] = KnownFeatures(maps)
     decoder: Decoder = Identity(map_shape(maps)[-1])
-    features = {"features": describe_maps(run, maps)}
+    features, device = {"features": describe_maps(run, maps)}, training_device()
     inputs: dict[str, Any] = dict(features)
     if method.codebook is not None:  # Adaptive Data Compression, Sec. 3.3.1: the codebook S
-        book = _learn(run, "codebook", features, method.codebook, partial(fit_codebook, maps))
+        book = _learn(run, "codebook", features, method.codebook, partial(fit_codebook, maps, device=device))
         codebook = Codebook.load(book.folder / "codebook.safetensors")
 
         def quantize(folder: Path) -> None:  # Eq. 5: the index map M of every view
-            quantize_maps(maps, codebook, progress=run.progress is True).save(folder / "index_maps.safetensors")
+            indices = quantize_maps(maps, codebook.to(device), progress=run.progress is True)
+            indices.save(folder / "index_maps.safetensors")
 
         indexed = run.stage("index_maps", features | {"codebook": book.key}, quantize)
         inputs, latents, decoder = {"index_maps": indexed.key}, codebook.codewords, Codewords(codebook)
         if method.autoencoder is not None:  # Semantic Compression, Sec. 3.3.2: encoder E and decoder Psi
-            learn = partial(fit_autoencoder, codebook.to(training_device()))
+            learn = partial(fit_autoencoder, codebook.to(device))
             coder = _learn(run, "autoencoder", {"codebook": book.key}, method.autoencoder, learn)
             autoencoder = Autoencoder.load(coder.folder / "autoencoder.safetensors")
             inputs["autoencoder"], decoder = coder.key, Autoencoded(codebook, autoencoder)
@@ -222,7 +223,9 @@ def _paper(
     answers = run.stage(
         "answers", {"field": trained.key}, lambda folder: fuse_views(field, cameras).save(folder / NAME)
     )
-    return SemanticField.load(answers.folder), {"method": "paper", "steps": {"field": training.steps}}
+    kind, changed = method.codebook and type(method.codebook).__name__, ", ".join(changes(method, Paper.paper()))
+    about = {"method": "paper", "codebook": kind, "changed_from_paper": changed or "nothing"}
+    return SemanticField.load(answers.folder), about | {"steps": {"field": training.steps}}
 
 
 def _learn(

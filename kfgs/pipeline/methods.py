@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field, is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -36,12 +37,15 @@ class Uplift:
 
 @dataclass(frozen=True)
 class Paper:
-    """Compress the maps per pixel, then train Gaussians on them (Sec. 3). The defaults are for a CPU; see `paper`."""
+    """The paper's method (Sec. 3): compress the maps per pixel, then train Gaussians on them.
 
-    codebook: GrownCodebook | PaperCodebook | None = field(default_factory=GrownCodebook)
+    Codebook and autoencoder are the paper's, the field's schedule is one for a CPU. See also `paper` and `grown`.
+    """
+
+    codebook: PaperCodebook | GrownCodebook | None = field(default_factory=PaperCodebook)
     """Adaptive Data Compression (Sec. 3.3.1). None, with `autoencoder=None`: the field is trained on the raw features, the
     row "just decouple" of Table 1."""
-    autoencoder: AutoencoderConfig | None = field(default_factory=AutoencoderConfig)
+    autoencoder: AutoencoderConfig | None = field(default_factory=AutoencoderConfig.paper)
     """Semantic Compression (Sec. 3.3.2). None: a Gaussian has all D channels, the row "decouple+ADC" of Table 1."""
     training: Training = field(default_factory=Training.cpu)
     """Training of the decoupled field (Eq. 4)."""
@@ -54,14 +58,25 @@ class Paper:
 
     @staticmethod
     def paper(**changes: Any) -> Paper:
-        """The paper's values: 28 epochs, 5,000 steps of the autoencoder, 30,000 of the field. For a workstation."""
-        options: dict[str, Any] = {
-            "codebook": PaperCodebook(),
-            "autoencoder": AutoencoderConfig.paper(),
-            "training": Training(),
-        }
+        """With the paper's schedule of the field, too: 30,000 steps. For a workstation."""
+        return Paper(**({"training": Training()} | changes))
+
+    @staticmethod
+    def grown(**changes: Any) -> Paper:
+        """With kfgs's own codebook, and an autoencoder that learns blends of codewords as well."""
+        options: dict[str, Any] = {"codebook": GrownCodebook(), "autoencoder": AutoencoderConfig()}
         return Paper(**(options | changes))
 
     def options(self) -> dict[str, Any]:
         """The options as JSON."""
         return {"method": "paper", **asdict(self)}
+
+
+def changes(ours: Any, papers: Any, place: str = "") -> Iterator[str]:
+    """Options that decide the result and differ from the paper's, as `codebook.maximum=50`."""
+    for name, own in vars(ours).items():
+        printed = getattr(papers, name)
+        if is_dataclass(own) and type(own) is type(printed):
+            yield from changes(own, printed, f"{place}{name}.")
+        elif own != printed and name not in ("report_every", "checkpoint_every"):
+            yield f"{place}{name}={own}"

@@ -52,6 +52,9 @@ def test_the_run_folder_holds_every_stage_and_the_field(trained, runs):
     loaded = SemanticField.load(run / "field.kfgs")
     assert same(loaded, trained)
     assert loaded.info["method"] == "paper"
+    assert loaded.info["codebook"] == "PaperCodebook"
+    assert loaded.info["changed_from_paper"].startswith("codebook.maximum=24, codebook.initial=4, codebook.epochs=4")
+    assert "codebook: PaperCodebook" in loaded.summary()
     assert loaded.latents.shape[1] == 4
     losses = [row["loss"] for row in read_json(Run(run).finished("field")[0].folder / "history.json")]
     assert losses[-1] < 0.7 * losses[0]
