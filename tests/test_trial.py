@@ -110,7 +110,11 @@ def test_9_a_label_map_with_a_legend(scene, field):
     assert labels.equal(field.segment(scene[0].name.removesuffix(".png")))
     refused(lambda: field.segment("view"), "camera:", "got 'view'", "did you mean 'view_")
     assert field.segment(scene[:2])[0].equal(labels)
-    assert field.segment(to_kornia(scene)).shape == (len(scene), *labels.shape)
+    assert (
+        field.segment(to_kornia(scene)).shape
+        == field.render(to_kornia(scene)).alpha.shape
+        == (len(scene), *labels.shape)
+    )
     pictures = [
         viz.overlay_labels(scene.image(0), labels, n) for n in (field.names, field.classes, field, field.label())
     ]

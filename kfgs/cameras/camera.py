@@ -228,8 +228,8 @@ def unit_vector(name: str, vector: Tensor | Sequence[float]) -> Tensor:  # [3] f
     return values / length
 
 
-def view_named(cameras: Sequence[Camera], view: str | Camera, where: str) -> Camera:
-    """The one camera of a name, with or without its ending; a camera is itself. Errors begin with `where`."""
+def view_named(cameras: Sequence[Camera], view: Any, where: str) -> Camera:
+    """The one camera of a name, with or without its ending; anything else as it is. Errors begin with `where`."""
     if not isinstance(view, str):
         return view
     names = _names(tuple(camera.name for camera in cameras))

@@ -137,7 +137,7 @@ class SemanticField:
 
     # Maps
 
-    def render(self, camera: Camera | str, *, engine: str = "auto") -> Rendering:
+    def render(self, camera: Cameras | str, *, engine: str = "auto") -> Rendering:
         """The latent map F_r (Eq. 3) from a viewpoint, with its alpha. No gradient.
 
         Here and below, a viewpoint is a camera, or the name of one of the field's own: `field.segment("f01")`; `render` and
