@@ -142,16 +142,16 @@ def as_cameras(cameras: Any, advice: str = "", *, one_size: bool = False) -> lis
     """
     if isinstance(cameras, PinholeCamera):
         return from_kornia(cameras)
-    views = getattr(cameras, "cameras", [cameras] if isinstance(cameras, Camera) else cameras)
-    wrong = [view for view in views if not isinstance(view, Camera)] if isinstance(views, Iterable) else [views]
-    if wrong:
+    given = getattr(cameras, "cameras", [cameras] if isinstance(cameras, Camera) else cameras)
+    views = list(given) if isinstance(given, Iterable) else [given]
+    if wrong := [view for view in views if not isinstance(view, Camera)]:
         got = f"{type(wrong[0]).__name__}; take some of scene.cameras, or convert kornia's with from_kornia"
         raise TypeError(f"cameras: expected a Camera, a list of them, a Scene or kornia's PinholeCamera, got {got}")
     if advice and not views:
         raise ValueError(f"cameras: expected at least one camera, got none; {advice}")
     if one_size and len(sizes := {view.size for view in views}) != 1:
         raise ValueError(f"cameras: expected one size, to stack what they see, got {sizes}; use camera.resized()")
-    return list(views)
+    return views
 
 
 def to_kornia(cameras: Cameras) -> PinholeCamera:

@@ -223,6 +223,8 @@ def test_what_kornia_cannot_hold_is_refused():
     bent = replace(CAMERAS[1], distortion=Distortion("kannala_brandt", (0.1, 0, 0, 0)))
     refused(lambda: to_kornia([CAMERAS[0], bent]), "camera:", "got kannala_brandt", "'b.png'")
     refused(lambda: to_kornia([]), "cameras:", "got none")
+    assert len(to_kornia(camera for camera in CAMERAS).height) == 2
+    refused(lambda: to_kornia([None]), "cameras:", "got NoneType", "from_kornia", error=TypeError)
     flat = CameraModel(ImageSize(4, 4), CameraModelType.ORTHOGRAPHIC, torch.ones(4))
     refused(lambda: from_kornia(flat), "pinhole:", "perspective", "Orthographic", error=TypeError)
     pinhole = to_kornia(CAMERAS)
