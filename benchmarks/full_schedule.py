@@ -26,16 +26,17 @@ from typing import Any
 import torch
 from table1_rows import fitting_seconds
 from torch import Tensor
-from torch.nn.functional import normalize
+from torch.nn.functional import grid_sample, normalize
 
 from kfgs import FeatureFolder, Paper, fit, load_label_set, load_scene
 from kfgs._files import read_json, write_json
-from kfgs.cameras import resize_map
+from kfgs.cameras import from_bchw, resize_map, to_bchw
 from kfgs.evaluation import evaluate_segmentation
 from kfgs.labels import LabelSet
 from kfgs.metrics import MIB, semantic_storage_bytes
 from kfgs.pipeline import true_labels
 from kfgs.quant import sample_grid
+from kfgs.quant.maps import grid_slices
 
 SIZE, CHANNELS, FREQUENT = (360, 480), 24, 10
 STEPS = (500, 1_500, 2_500, 5_000, 10_000, 15_000, 30_000)
@@ -54,8 +55,19 @@ class Enlarged(Sequence[Tensor]):
         return len(self._maps)
 
     def __getitem__(self, i: int) -> Tensor:  # type: ignore[override]  # [360, 480, D]
+        return resize_map(self._small(i), SIZE)
+
+    def _small(self, i: int) -> Tensor:
         small = self._maps[i].float()
-        return resize_map(small if self._basis is None else small @ self._basis, SIZE)
+        return small if self._basis is None else small @ self._basis
+
+    def grid(self, i: int, samples: int) -> Tensor:  # [n, D]
+        """`quant.sample_grid(maps[i], samples=samples)`, enlarging nothing else."""
+        axes = [torch.arange(n)[part] for n, part in zip(SIZE, grid_slices(*SIZE, samples), strict=True)]
+        y, x = ((2 * axis + 1) / n - 1 for axis, n in zip(axes, SIZE, strict=True))
+        places = torch.stack(torch.meshgrid(x, y, indexing="xy"), -1)[None]
+        found = grid_sample(to_bchw(self._small(i)), places, padding_mode="border", align_corners=False)
+        return from_bchw(found).flatten(0, 1)
 
 
 def principal(maps: Sequence[Tensor]) -> Tensor:  # [D, d]
