@@ -79,8 +79,8 @@ def fit_codebook(
     """Fit a codebook to the feature maps of a scene: K features that stand for all others.
 
     Args:
-        maps: one map per image, read one at a time. Sizes may differ, D may not. All-zero features are left out; half
-            precision is computed in float32.
+        maps: one map per image, read one at a time; channels are last, which nothing here can check. Sizes may differ, D may
+            not. All-zero features are left out; half precision is computed in float32.
         options: `GrownCodebook` (also if None), kfgs's own, reads each map once; `PaperCodebook` (Eq. 5-9) once per epoch.
         device: computes, and has the codebook; None: that of the maps. Maps are moved one at a time.
         generator: draws the first directions of splits, or the order of the images; None: seed 0. On a CPU the same state
@@ -91,11 +91,14 @@ def fit_codebook(
         The codebook; its `report` has the history, and how well it represents the sampled features.
 
     Raises:
-        ValueError: if there is no map, a map has another shape or is not finite, or every feature is zero.
+        ValueError: if there is no map, `maps` is one array, a map has another shape or is not finite, or all features are zero.
     """
     options, count = options or GrownCodebook(), len(maps)
     if count == 0:
         raise ValueError("maps: expected at least one feature map, got none; encode the training images first")
+    if len(shape := getattr(maps, "shape", ())) == 4:  # [B, h, w, D], or torch's [B, D, h, w]?
+        way = "pass [kfgs.cameras.from_bchw(map) for map in maps] if channels are second, list(maps) if they are last"
+        raise ValueError(f"maps: expected a list of maps [h, w, D], got one array {tuple(shape)}; {way}")
     samples = options.samples if isinstance(options, PaperCodebook) else min(SAMPLES, -(-POOL // count))
     channels: list[int] = []
 

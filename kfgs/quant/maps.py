@@ -124,9 +124,6 @@ class LatentMaps(Sequence[Tensor]):
         self.index_maps = index_maps
         self._rows = torch.cat([latents, torch.full_like(latents[:1], torch.nan)])
 
-    def __repr__(self) -> str:
-        return f"LatentMaps({len(self)} maps, {self._rows.shape[1]} channels)"
-
     def __len__(self) -> int:
         return len(self.index_maps)
 

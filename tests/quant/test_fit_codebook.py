@@ -125,6 +125,7 @@ def test_the_table_of_concepts_has_the_fields_and_their_values():
 
 def test_bad_maps():
     refused(lambda: fit_codebook([]), "maps:", "got none")
+    refused(lambda: fit_codebook(np.ones((1, 64, 50, 100))), "list of maps", "(1, 64, 50, 100)", "from_bchw")
     refused(lambda: fit_codebook([torch.zeros(2, 3, 4)] * 2), "maps:", "zero", "got 2")
     refused(lambda: fit_codebook([torch.ones(2, 3, 4), torch.ones(2, 3, 5)]), "maps[1]:", "[n, 4]", "got (6, 5)")
     refused(lambda: fit_codebook([torch.ones(3, 4)]), "maps[0]:", "[h, w, D]", "got (3, 4)")
