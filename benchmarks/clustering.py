@@ -5,7 +5,7 @@
 ROOM has labels/ and labels_scored/ (room_0); TOKENS are DINOv2's maps of all views (`unseen.py maps` writes OUT/tokens/NAME);
 WORDS.npy has a text row per class. A head is fitted on the labels of a few training views, evenly spread. Then, with each book
 (the paper's codebook, seeds 0 to 3; kfgs's own): "flat", the teacher's maps of the test views, quantised or not, by the nearest
-text, also with texts of which three draws of noise are added (sigma times the unit row's length); and "field", Gaussians
+text, also with texts to which noise is added (three draws, sigma times the length of a unit row); and "field", Gaussians
 trained on the maps for 1,000 steps of `Training.cpu()` in 24 principal channels, labelled by Sec. 3.4. All classes, and in
 brackets the ten with the most pixels. Finished cells are read back.
 """

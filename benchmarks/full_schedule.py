@@ -6,7 +6,7 @@
 FEATURES has a teacher's map of every training view. They are enlarged to 360x480 as they are read (bilinear; the paper's LSeg
 maps are enlarged, too), so that nothing large is written. "Just decouple" and "ADC" train on the first 24 principal channels
 of the features (their share of the energy is printed) instead of on all: 512 channels would take days on a CPU. Codebook and
-"ADC + SC" see all of them. An hour or two a row on two cores; a killed run goes on from its last 1,000 steps.
+"ADC + SC" see all of them. An hour or two a row on two cores; a killed run continues from its last 1,000 steps.
 
 Labels of ADC and ADC + SC follow Sec. 3.4 (decode, quantise, look up), those of decouple are the text nearest to the feature.
 Storage is that of Table 1 with the channels that were trained; "at D" with all of the teacher's channels, as published.

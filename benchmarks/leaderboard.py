@@ -52,6 +52,7 @@ accuracy are `{PROTOCOL}`; IoU7 is `feature3dgs-teacher/1` with the scene's clas
 "Nearest text / votes" is the mIoU if pixels take the text nearest to their rendered feature, and if Gaussians vote with the
 softmax of 100 cosines, as kfgs's default does; the mIoU before it is by the method's own rule. Minutes are those of training,
 without the teacher and the Gaussians that methods share. [Results](results.md#other-methods) says what is not as published.
+The paper's rows (decouple, ADC, SC) were measured before its codebook grew as Eq. 8 is printed, and before labels by Sec. 3.4.
 
 To run a row again, make what all rows share, once; then type the command below the table, with the name of the row as ROW. OUT is
 any folder of yours:

@@ -17,7 +17,7 @@ import matplotlib.pyplot as plt
 HERE = Path(__file__).resolve().parent
 TABLES = {  # the line above a table, and its panel's title
     "Table 1 with the ADE20K network": "an ADE20K network",
-    "Table 1 with the head of the other rooms": "DINOv2, a head of other rooms",
+    "Table 1 with the head of the other rooms": "DINOv2, head of other rooms",
 }
 NAMES = {
     "kfgs default": "kfgs",
@@ -42,7 +42,8 @@ def rows_below(text: str, caption: str) -> dict[str, list[float | None]]:
 def main(out: Path) -> None:
     """Draw the figure."""
     text = (HERE.parent / "results.md").read_text(encoding="utf-8")
-    figure, panels = plt.subplots(1, len(TABLES), figsize=(8.6, 3.4), dpi=150, sharex=True)
+    figure, panels = plt.subplots(1, len(TABLES), figsize=(9.2, 3.4), dpi=150, sharex=True)
+    most = 0  # rows of a panel
     for axes, (caption, title) in zip(panels, TABLES.items(), strict=True):
         table = rows_below(text, caption)
         teacher = next(values for name, values in table.items() if name.startswith("the teacher"))
@@ -56,12 +57,14 @@ def main(out: Path) -> None:
             color = "#d55e00" if name == "kfgs" else "#5b6b7b"
             axes.scatter(gains[name], [y] * len(gains[name]), s=12, color=color, alpha=0.5, linewidths=0)
             axes.scatter(mean(gains[name]), y, s=60, color=color, zorder=3)
+        most = max(most, len(order))
+        axes.set_ylim(len(order) - 0.5 - most, len(order) - 0.5)
         axes.axvline(0, color="#5b6b7b", linestyle="--", linewidth=1)
         axes.set_yticks(range(len(order)), order, fontsize=9)
         for label in axes.get_yticklabels():
             label.set_fontweight("bold" if label.get_text() == "kfgs" else "normal")
         axes.set_title(f"{title} (alone: {mean(teacher):.1f})", fontsize=10)  # type: ignore[type-var, arg-type]
-        axes.set_xlabel("mIoU of unseen views, against the network alone", fontsize=9)
+        axes.set_xlabel("points of mIoU above the network alone", fontsize=9)
         axes.spines[["top", "right"]].set_visible(False)
         axes.grid(alpha=0.25, axis="x")
     figure.tight_layout()
