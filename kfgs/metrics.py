@@ -117,6 +117,11 @@ class ConfusionMatrix:
         cells = target * (self.classes + 1) + pred
         self._counts += torch.bincount(cells, minlength=self._counts.numel()).view_as(self._counts).cpu()
 
+    def merge(self, table: Tensor) -> None:  # [C + 1] int64
+        """Count class k as class `table[k]` from now on, in truth and prediction; `table` ends with -1."""
+        rows = torch.zeros_like(self._counts).index_add(0, table[:-1], self._counts)
+        self._counts = torch.zeros_like(rows).index_add(1, table % (self.classes + 1), rows)  # -1: misses stay misses
+
     def _check(self, name: str, labels: Tensor, count: int, advice: str) -> None:
         if labels.numel() and not (labels.min() >= 0 and labels.max() < count):
             raise ValueError(

@@ -146,11 +146,9 @@ class FieldMethod:
 
     def labels(self, view: View, text: Tensor) -> Tensor:  # [K, D] -> [H, W] int64
         """The class of each pixel by the method's rule."""
-        return (
-            best_labels(self.cosines(view, text)[0])
-            if self.rule == "nearest"
-            else self._asked.segment(view.camera, text)
-        )
+        if self.rule == "nearest":
+            return best_labels(self.cosines(view, text)[0])
+        return self._asked.segment(view.camera, text)
 
     def gaussian_cosines(self, text: Tensor) -> Tensor:  # [K, D] -> [1, N, K]
         """The cosine of each Gaussian's fused feature with each text (`SemanticField.cosines`)."""
@@ -185,10 +183,8 @@ class TeacherMethod:
         wide = torch.promote_types(features.dtype, torch.float32)  # half precision is computed in float32
         unit = unit_embeddings(text, "text").to(features.device, wide)
         check_shapes((f"the map of {stem!r}", features, ("h", "w", unit.shape[1])))
-        products, squares = (
-            torch.zeros(*view.camera.size, len(unit)).to(unit),
-            torch.zeros(*view.camera.size, 1).to(unit),
-        )
+        products = unit.new_zeros(*view.camera.size, len(unit))
+        squares = unit.new_zeros(*view.camera.size, 1)
         for some, rows in zip(features.split(CHANNELS, dim=2), unit.split(CHANNELS, dim=1), strict=True):
             band = resize_map(some.to(wide), view.camera.size, align_corners=self.align_corners)
             products += band @ rows.T

@@ -173,8 +173,7 @@ def get_protocol(name: str, protocols: dict[str, Any] = PROTOCOLS, **options: An
         >>> get_protocol("feature3dgs-teacher", split=None).split is None
         True
     """
-    known = (kind for key, kind in protocols.items() if name in (key, key.partition("/")[0]))
-    kind = next(known, None)
+    kind = next((kind for key, kind in protocols.items() if name in (key, key.partition("/")[0])), None)
     if kind is None:
         near = difflib.get_close_matches(name, protocols, n=3, cutoff=0.4)
         hint = f"; did you mean {' or '.join(near)}?" if near else ""

@@ -95,7 +95,8 @@ def evaluate_segmentation(
         labels = as_tensor(f"predict({stem!r})", answer(stem))
         if labels.shape != target.shape:
             labels = resize_labels(labels, (int(target.shape[0]), int(target.shape[1])))
-        pooled.update(table.to(labels.device)[labels.long()], table.to(target.device)[target.long()])
+        pooled.update(labels, target)
+    pooled.merge(table)
     if int(pooled.matrix.sum() + pooled.misses.sum()) == 0:
         raise ValueError(f"truth: expected some pixel with a known label, got only void in {len(truth)} views")
     return SegmentationReport(

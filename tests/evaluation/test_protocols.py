@@ -1,3 +1,5 @@
+from functools import partial
+
 import cases_methods as cases
 import numpy as np
 import pytest
@@ -168,6 +170,10 @@ def test_bad_input_is_named(tmp_path):
     void = {"a": torch.full((1, 2), -1)}
     refused(lambda: evaluate_segmentation(void, {"a": path}, ["x", "y"]), "a.png:", "got 7")
     refused(lambda: evaluate_segmentation(void, void, ["x"]), "truth:", "pixel", "void")
+    truth = {"a": torch.tensor([[0, 1]])}
+    for wrong, error in ((-2, ValueError), (4, ValueError), (0.7, TypeError)):
+        answer = {"a": torch.tensor([[0, wrong]])}
+        refused(partial(evaluate_segmentation, answer, truth, NAMES), "pred: expected", "labels", error=error)
     (tmp_path / "broken.png").write_bytes(b"PNG?")
     refused(lambda: load_label_map(tmp_path / "broken.png"), "broken.png:", "labels", "decoded")
     refused(lambda: load_label_map(tmp_path / "none.png"), "none.png:", "no such file", error=FileNotFoundError)
