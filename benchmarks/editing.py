@@ -254,7 +254,7 @@ class UncoveredReport:
     """How the places look that a removed class covered; NaN where nothing was measured."""
 
     name: str
-    """The class that was removed."""
+    """The class that was removed, or moved."""
     psnr: float
     """Decibels."""
     ssim: float
@@ -267,7 +267,7 @@ class UncoveredReport:
 
     def __str__(self) -> str:
         return (
-            f"{self.name}: {self.psnr:.2f} dB, SSIM {self.ssim:.3f} where it was ({self.pixels:,} pixels of "
+            f"{self.name}: {self.psnr:.2f} dB, SSIM {self.ssim:.3f} over its pixels ({self.pixels:,} pixels of "
             f"{self.views} views); untouched elsewhere: {self.untouched_pixels:.4f} ({self.protocol.split(':')[0]})"
         )
 

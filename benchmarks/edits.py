@@ -138,7 +138,7 @@ def uncovered(name: str, pairs: list[tuple[Path, Path]]) -> None:
             f"fill={fill}": EditList((Remove(name.split(","), fill),)) for fill in (False, True)
         }
         if (folder / "moved").is_dir():
-            by = read_json(Path(__file__).parent / "rooms" / f"{folder.resolve().name}.json")["moved"]
+            by = read_json(folder / "plan.json")["options"]["moved"]
             rules["moved"] = EditList((Move(name.split(","), translation=by),))
         for rule, edits in rules.items():
             started = time.perf_counter()

@@ -247,7 +247,7 @@ def main() -> None:
     width, height = map(int, args.size.split("x"))
     lens = Lens(width, height, 0.65 * width)  # 75 degrees from side to side
     without = about["without"] if args.without is None else args.without
-    options = vars(args) | {"scene": table.stem, "out": None, "without": without}
+    options = vars(args) | {"scene": table.stem, "out": None, "without": without, "moved": about.get("moved")}
     room = Room(args.scene, about["metres_per_unit"])
     things, file = Things(about["things"], room.shapes), args.out / "plan.json"
     removed = things.named(without)
@@ -264,7 +264,7 @@ def main() -> None:
     views = {stem: np.array(pose) for stem, pose in plan["views"].items()}
     jobs = [(room, things, args.out, stem) for stem in views]
     test = [stem for stem in views if stem.startswith("test")]
-    edited = {"without": None} | ({"moved": about["moved"]} if "moved" in about else {})
+    edited = {"without": None} | ({"moved": options["moved"]} if options["moved"] else {})
     for folder, shift in edited.items() if removed else ():
         other = Room(args.scene, about["metres_per_unit"], removed, shift)
         kept = Things(about["things"], other.shapes, removed)

@@ -148,7 +148,8 @@ def test_tables_fit_the_published_scenes(name):
     shapes = [e.get("id") for e in rooms.mend(SOURCES / name).iter("shape")]
     things = rooms.Things(about["things"], shapes)
     assert {"wall", "floor", "ceiling"} <= set(things.classes)
-    assert 0 < len(things.named(about["without"])) < len(shapes)
+    moved = rooms.mend(SOURCES / name, chosen := things.named(about["without"]), (1.0, 0.0, 0.5))
+    assert 0 < len(moved.findall("shape/transform/translate[@z='0.5']")) == len(chosen) < len(shapes)
 
 
 def test_a_room_is_rendered_and_continued(tmp_path, monkeypatch, capsys):
