@@ -82,7 +82,7 @@ def test_edits_of_nothing_and_of_a_wrong_class_do_not_pass(room, cloud, mask):
     assert same.hue_inside == same.hue_before < 0.1
     assert same.to_json()["psnr_outside"] is None
     wrong = score_recolor(cloud, recolor(cloud, mask["wall"], BLUE), room, "chair", BLUE)
-    assert wrong.psnr_outside < 20 and not any(each.passed for each in (report, same, wrong))
+    assert [wrong.psnr_outside < 20, *(each.passed for each in (report, same, wrong))] == [True, False, False, False]
 
 
 @pytest.mark.parametrize("name", ["chair", "rug"])
