@@ -39,6 +39,10 @@ def test_the_renderer_is_rasterize_of_each_camera_in_kornias_layout():
             torch.testing.assert_close(views.map[i].permute(1, 2, 0), expected.map)
             torch.testing.assert_close((views.alpha[i, 0], views.depth[i, 0]), (expected.alpha, expected.depth))
     assert list(renderer.state_dict()) == ["background"]
+    deep = float(CLOUD.means[:, 2].median())  # some are in front of it
+    cut = GaussianRenderer(near=deep)(CLOUD, CAMERAS)
+    assert cut.rendering.map.equal(rasterize(CLOUD, CAMERAS, near=deep).map)
+    refused(lambda: GaussianRenderer(engine="fast")(CLOUD, CAMERAS), "engine:", "got 'fast'")
     other = [CAMERAS[0], CAMERAS[1].resized(9, 12)]
     refused(lambda: renderer(CLOUD, other), "cameras: expected one size", "(9, 12)", "resized")
     refused(lambda: renderer(CLOUD, CAMERAS[0].model), "got CameraModel", "from_kornia", error=TypeError)
@@ -71,6 +75,19 @@ def test_the_quantizer_is_equation_5_with_a_straight_gradient():
     chosen = layer.codewords.detach().requires_grad_()
     assert torch.autograd.gradcheck(lambda rows: functional_call(layer, {"codewords": rows}, FEATURES).map, chosen)
     refused(lambda: layer(FEATURES[0]), "features: expected [B, 6, H, W]", "got (6, 3, 4)")
+    kept, given = layer.codebook(), BOOK.codewords.clone()
+    assert layer(FEATURES.float()).indices.equal(indices)  # of another dtype than the codewords
+    with torch.no_grad():
+        layer.codewords.zero_()
+    assert kept.codewords.equal(given)
+    assert BOOK.codewords.equal(given)
+
+
+def test_half_precision_around_the_quantizer_changes_no_codeword():
+    layer, features = VectorQuantizer(torch.randn(200, 6)), torch.randn(2, 6, 30, 40)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        indices = layer(features).indices
+    assert indices.equal(layer(features).indices)
 
 
 def test_the_autoencoder_over_maps_has_all_gradients_and_comes_back(coder):
@@ -81,11 +98,10 @@ def test_the_autoencoder_over_maps_has_all_gradients_and_comes_back(coder):
     names, weights = zip(*layer.named_parameters(), strict=True)
     call = lambda x, *values: functional_call(layer, dict(zip(names, values, strict=True)), x)  # noqa: E731
     assert torch.autograd.gradcheck(call, (FEATURES[:1, :, :2].clone().requires_grad_(), *weights))
-    torch.nn.utils.vector_to_parameters(
-        0.9 * torch.nn.utils.parameters_to_vector(layer.parameters()), layer.parameters()
-    )
+    layer.load_state_dict({name: 0.9 * value for name, value in layer.state_dict().items()})
     back = layer.autoencoder()
     assert not any(weight.requires_grad for weight in back.parameters())
+    assert all(weight.requires_grad for weight in layer.parameters())
     assert back.encode(rows).equal(layer.encode(FEATURES).movedim(1, -1))
     assert not back.encode(rows).equal(coder.encode(rows))  # the one it began with is as it was
     refused(lambda: layer.decode(FEATURES), "latents: expected [B, 3, H, W]", "got (2, 6, 3, 4)")
