@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import torch
-from kornia.geometry.liegroup import Se3, So3
-from kornia.geometry.quaternion import Quaternion
+from kornia.geometry.liegroup import Se3
+from kornia.geometry.pose import NamedPose
 from kornia.image import ImageSize
 from kornia.sensors.camera import CameraModel, CameraModelType
 from torch import Tensor
@@ -66,14 +66,15 @@ class Camera:
     distortion: Distortion | None = None
     near: float = NEAR  # > 0, world units: the smallest depth that is drawn
     origin: tuple[float, float, float] = ORIGIN  # where the (0, 0, 0) that viewmat maps from lies in the world
+    size = property(lambda self: (self.height, self.width), doc="(height, width) in pixels.")
     R = property(lambda self: self.viewmat[:3, :3], doc="The rotation from world to camera [3, 3].")
     t = property(lambda self: self.viewmat[:3, 3], doc="The translation from world to camera [3]: x_camera = R x + t.")
     c2w = property(lambda self: torch.linalg.inv(self.viewmat), doc="Camera to world [4, 4], the inverse of `viewmat`.")
     center = property(lambda self: -self.R.T @ self.t, doc="The camera's position [3], counted from `origin`.")
-    fx = property(lambda self: float(self.K[0, 0]), doc="The horizontal focal length, pixels.")
-    fy = property(lambda self: float(self.K[1, 1]), doc="The vertical focal length, pixels.")
-    cx = property(lambda self: float(self.K[0, 2]), doc="The principal point, pixels from the left edge.")
-    cy = property(lambda self: float(self.K[1, 2]), doc="The principal point, pixels from the upper edge.")
+    fx = property(lambda self: float(self.K.detach()[0, 0]), doc="The horizontal focal length, pixels.")
+    fy = property(lambda self: float(self.K.detach()[1, 1]), doc="The vertical focal length, pixels.")
+    cx = property(lambda self: float(self.K.detach()[0, 2]), doc="The principal point, pixels from the left edge.")
+    cy = property(lambda self: float(self.K.detach()[1, 2]), doc="The principal point, pixels from the upper edge.")
     intrinsics_at_integer_centers = property(
         lambda self: self.K - self.K.new_tensor([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]),
         doc="K [3, 3] for functions that put the centre of the first pixel at (0, 0), as kornia's grids do: cx, cy less 0.5.",
@@ -82,8 +83,8 @@ class Camera:
     pose = property(lambda self: Se3.from_matrix(self.viewmat.clone()), doc="The viewmat as kornia's `Se3`.")
 
     def __post_init__(self) -> None:
-        for name in ("viewmat", "K"):  # integers would truncate the points
-            object.__setattr__(self, name, as_tensor(name, as_matrix(getattr(self, name)), floating=True))
+        for name, value in (("viewmat", as_matrix(self.viewmat, source="world")), ("K", self.K)):
+            object.__setattr__(self, name, as_tensor(name, value, floating=True))  # integers would truncate the points
         check_shapes(("viewmat", self.viewmat, "4 4"), ("K", self.K, "3 3"))
         object.__setattr__(self, "origin", as_origin(self.origin))
         for name, size in (("width", self.width), ("height", self.height)):
@@ -151,11 +152,6 @@ class Camera:
         place = ", ".join(f"{value:.{4 if self.origin == ORIGIN else 10}g}" for value in center.tolist())
         return f"Camera({cut(self.name, 80)!r}, {self.width}x{self.height}, fov {fov:.1f}, at ({place}){lens})"
 
-    @property
-    def size(self) -> tuple[int, int]:
-        """(height, width) in pixels."""
-        return self.height, self.width
-
     def resized(self, height: int, width: int) -> Camera:
         """The same view with another number of pixels; the two axes scale independently (kornia's `scale` does not).
 
@@ -200,10 +196,26 @@ def kornia_model(K: Tensor, distortion: Distortion | None, size: tuple[int, int]
     return CameraModel(ImageSize(*size), kind, params)
 
 
-def as_matrix(value: Any) -> Any:
-    """The matrix of kornia's `Se3`, `So3`, `Quaternion` or `NamedPose`, also of a batch of one; anything else as it is."""
-    value = getattr(value, "pose", value)  # of a NamedPose
-    return value.matrix().squeeze(0) if isinstance(value, Se3 | So3 | Quaternion) else value
+def check_camera(camera: Any) -> None:
+    """Raise a TypeError if a function that takes one camera got something else."""
+    if not isinstance(camera, Camera):
+        advice = "take one of scene.cameras, or convert kornia's with from_kornia"
+        raise TypeError(f"camera: expected a Camera, got {type(camera).__name__}; {advice}")
+
+
+def as_matrix(value: Any, *, source: str | None = None) -> Any:
+    """The matrix of kornia's `Se3` (or a batch of one), `So3`, `Quaternion` or `NamedPose`, pycolmap's `Rigid3d`; or the value.
+
+    A ValueError if a `NamedPose` ends in the frame `source`, where it should begin.
+    """
+    if isinstance(value, NamedPose):
+        if value.frame_dst.lower() == source:
+            raise ValueError(f"pose: expected one from the {source}, got one that ends there; pass its .inverse()")
+        value = value.pose
+    if not callable(getattr(value, "matrix", None)):
+        return value
+    matrix = torch.as_tensor(value.matrix()).squeeze(0)
+    return torch.cat([matrix, matrix.new_tensor([[0.0, 0, 0, 1]])]) if matrix.shape == (3, 4) else matrix
 
 
 def exact_rotation(name: str, matrix: Tensor) -> Tensor:  # [3, 3] -> [3, 3] float64

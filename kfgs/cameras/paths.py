@@ -78,8 +78,7 @@ def path_cameras(
 def _durations(centers: Array, rotations: Rotation) -> Array:  # [k - 1]
     """Time from each key to the next: hypot(distance / extent, angle / pi)."""
     extent = float(np.linalg.norm(np.ptp(centers, axis=0)))
-    if extent <= STANDING * np.abs(centers).max():
-        extent = 1.0
+    extent = extent if extent > STANDING * np.abs(centers).max() else 1.0
     angles = (rotations[1:] * rotations[:-1].inv()).magnitude()
     return np.hypot(np.linalg.norm(np.diff(centers, axis=0), axis=1) / extent, angles / np.pi)
 
@@ -206,8 +205,7 @@ def orbit_cameras(
     near = max(distance - radius * (1 - orbit.cut), 1e-3 * distance)
     zenith = unit_vector("up", up)
     axis = torch.eye(3, dtype=torch.float64)[int(zenith[0].abs() > 0.9)]  # azimuth 0 is x, or y where x is nearly up
-    north = torch.linalg.cross(zenith, axis)
-    north /= north.norm()
+    north = unit_vector("north", torch.linalg.cross(zenith, axis))
     east, e = torch.linalg.cross(north, zenith), radians(orbit.elevation_degrees)
     cameras = []
     for number, a in enumerate(np.linspace(0, 2 * pi, orbit.frames, endpoint=False)):

@@ -20,9 +20,9 @@ from kornia.sensors.camera.projection_model import Z1Projection
 from torch import Tensor
 
 from .._check import as_tensor, check_range, check_shapes
-from .camera import Camera, Distortion, DistortionModel, kornia_model
+from .camera import Camera, Distortion, DistortionModel, as_matrix, check_camera, kornia_model
 
-Cameras: TypeAlias = Camera | Sequence[Camera] | PinholeCamera  # a Scene and a field stand for their `cameras`
+Cameras: TypeAlias = Camera | Sequence[Camera | PinholeCamera] | PinholeCamera  # a Scene, a field: their `cameras`
 MAX_SLOPE = 1e4  # |x / z| beyond which a distorted point is clamped (89.99 degrees): r^6 must not overflow float32
 
 
@@ -99,9 +99,10 @@ def project_points(
     """
     check_range("near", near, 0)
     if not isinstance(camera, Camera):
-        views, clouds = as_cameras(camera), as_tensor("points", points)
-        pairs = zip(views, clouds if clouds.ndim == 3 else [clouds] * len(views), strict=True)
-        columns = zip(*(project_points(*pair, near=near) for pair in pairs), strict=True)
+        views, clouds = as_cameras(camera, "project to at least one"), as_tensor("points", points)
+        clouds = clouds if clouds.ndim == 3 else clouds.expand(len(views), *clouds.shape)
+        check_shapes((f"points (of {len(views)} cameras)", clouds, (len(views), "N", 3)))
+        columns = zip(*(project_points(*pair, near=near) for pair in zip(views, clouds, strict=True)), strict=True)
         return tuple(map(torch.stack, columns))  # type: ignore[return-value]
     points_cam = world_to_camera(camera, points)
     depth = points_cam[:, 2]
@@ -121,14 +122,15 @@ def unproject_depth(camera: Camera, depth: Tensor) -> Tensor:  # depth: [H, W] -
 
     A pixel of depth 0 (often "unknown") gives the centre of the camera: mask it.
     """
-    check_shapes(("depth", depth := as_tensor("depth", depth, floating=True), (camera.height, camera.width)))
     refuse_distortion(camera)
+    check_shapes(("depth", depth := as_tensor("depth", depth, floating=True), (camera.height, camera.width)))
     K = camera.intrinsics_at_integer_centers.to(depth)  # kornia's pixel grid counts from 0, not from 0.5
     return (depth_to_3d_v2(depth, K[None])[0] - camera.t.to(depth)) @ camera.R.to(depth)  # R^T (X - t)
 
 
 def refuse_distortion(camera: Camera) -> None:
-    """Raise a ValueError if a camera has a lens."""
+    """Raise a ValueError if a camera has a lens, a TypeError if it is none."""
+    check_camera(camera)
     if camera.distortion is not None:
         got = f"{camera.distortion.model} distortion (camera {camera.name!r})"
         advice = "undistort its images first (kfgs.cameras.undistort) and use the camera that returns"
@@ -140,10 +142,9 @@ def as_cameras(cameras: Any, advice: str = "", *, one_size: bool = False) -> lis
 
     With `advice`, a ValueError that ends with it if there are none; with `one_size`, one if their maps could not be stacked.
     """
-    if isinstance(cameras, PinholeCamera):
-        return from_kornia(cameras)
-    given = getattr(cameras, "cameras", [cameras] if isinstance(cameras, Camera) else cameras)
-    views = list(given) if isinstance(given, Iterable) else [given]
+    given = getattr(cameras, "cameras", [cameras] if isinstance(cameras, Camera | PinholeCamera) else cameras)
+    given = given if isinstance(given, Iterable) else [given]
+    views = [view for part in given for view in (from_kornia(part) if isinstance(part, PinholeCamera) else [part])]
     if wrong := [view for view in views if not isinstance(view, Camera)]:
         got = f"{type(wrong[0]).__name__}; take some of scene.cameras, or convert kornia's with from_kornia"
         raise TypeError(f"cameras: expected a Camera, a list of them, a Scene or kornia's PinholeCamera, got {got}")
@@ -183,19 +184,26 @@ def from_kornia(pinhole: PinholeCamera | CameraModel, pose: Any = None) -> list[
     centres on integers: add 0.5 to cx and cy of such a K first. A K from COLMAP has them on halves already.
 
     Args:
-        pinhole: a `PinholeCamera`, or a `CameraModel` with or without a lens (all but the orthographic one).
-        pose: of a `CameraModel`, from world to camera: an `Se3`, a `NamedPose` or a matrix [4, 4]; None: the identity.
+        pinhole: a `PinholeCamera`, or a `CameraModel` (not the orthographic one), whose lens becomes numbers without gradient.
+        pose: of a `CameraModel`, from world to camera: an `Se3`, a `NamedPose` or a matrix [4, 4]; None: the identity. B models
+            may share a pose, and B poses (an `Se3` of batch B, a tensor [B, 4, 4]) a model.
     """
     if not isinstance(pinhole, PinholeCamera):
         if not isinstance(getattr(pinhole, "projection", None), Z1Projection):
             raise TypeError(f"pinhole: expected a PinholeCamera or a perspective CameraModel, got {pinhole!r:.120}")
-        rows = pinhole.params.reshape(-1, pinhole.params.shape[-1])  # fx, fy, cx, cy, coefficients
+        rows = pinhole.params.reshape(-1, pinhole.params.shape[-1])  # [B, 4 + coefficients], first fx, fy, cx, cy
+        poses = torch.eye(4).to(rows) if pose is None else as_tensor("pose", as_matrix(pose, source="world"))
+        poses = poses.expand(len(rows), 4, 4) if poses.shape in ((4, 4), (1, 4, 4)) else poses
+        rows = rows.expand(len(poses), -1) if len(rows) == 1 else rows
+        check_shapes(("pose", poses, (len(rows), 4, 4)))
         kind: DistortionModel = "brown_conrady" if rows.shape[1] == 12 else "kannala_brandt"
         lenses = [Distortion(kind, tuple(row[4:].tolist())) if len(row) > 4 else None for row in rows]
         Ks = torch.eye(3).to(rows).repeat(len(rows), 1, 1)
         Ks[:, [0, 1, 0, 1], [0, 1, 2, 2]] = rows[:, :4]
-        size, pose = (int(pinhole.width), int(pinhole.height)), torch.eye(4).to(rows) if pose is None else pose
-        return [Camera(pose, K, *size, distortion=lens) for K, lens in zip(Ks, lenses, strict=True)]
+        size, parts = (int(pinhole.width), int(pinhole.height)), zip(poses, Ks, lenses, strict=True)
+        return [Camera(E, K, *size, distortion=lens) for E, K, lens in parts]
+    if pose is not None:
+        raise ValueError("pose: expected None with a PinholeCamera, got another; it has poses already, its extrinsics")
     shape = pinhole.batch_size, 4, 4
     check_shapes(*((f"pinhole.{name}", getattr(pinhole, name), shape) for name in ("intrinsics", "extrinsics")))
     viewmats, Ks = pinhole.extrinsics.clone(), pinhole.camera_matrix.clone()  # kornia's scale_ changes them in place

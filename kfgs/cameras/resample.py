@@ -14,7 +14,7 @@ from kornia.geometry.transform import resize
 from torch import Tensor
 
 from .._check import as_tensor, check_shapes, check_size
-from .camera import Camera
+from .camera import Camera, check_camera
 from .projection import fold_radius, plane_to_pixel
 
 SMALL = 8  # cells: the aspect of a smaller map says little
@@ -92,7 +92,7 @@ def check_layout(name: str, shape: Sequence[int], size: tuple[int, int]) -> None
     first, middle, last = shape
     tells = first != middle and min(middle, last) >= SMALL  # an encoder's grid may be square, whatever the picture
     if tells and not fits_aspect((first, middle), size) and fits_aspect((middle, last), size):
-        got = f"{tuple(shape)}, whose channels are first; convert it with kfgs.cameras.from_bchw"
+        got = f"{tuple(shape)}; if channels are first, kfgs.cameras.from_bchw; if last, kornia's resize of to_bchw(map)"
         raise ValueError(f"{name}: expected [h, w, D] in the shape of {size[0]} x {size[1]}, got {got}")
 
 
@@ -114,6 +114,7 @@ def undistort(
         The picture, 0 at unrecorded pixels; the camera without distortion; and the mask of recorded pixels: those within the
         distorted picture and the `fold_radius` of the lens. Within half a pixel of the border the outermost pixel is repeated.
     """
+    check_camera(camera)
     check_shapes(("image", image := as_tensor("image", image), f"{camera.height} {camera.width} C"))
     if not image.is_floating_point():
         raise TypeError(f"image: expected floating point, got {image.dtype}; convert it with .float() / 255")
@@ -129,12 +130,3 @@ def undistort(
     result = remap(to_bchw(image.to(dtype)), x[None], y[None], mode, "border", align_corners=True)
     result = from_bchw(result).where(recorded[..., None], 0).to(image.dtype)
     return result, replace(camera, distortion=None), recorded
-
-
-def undistort_labels(labels: Tensor, camera: Camera) -> Tensor:  # [H, W] integer -> [H, W], dtype of labels
-    """Remove the lens from a label map: each pixel takes the label of the nearest distorted pixel, unrecorded ones -1."""
-    check_shapes(("labels", labels, f"{camera.height} {camera.width}"))
-    if labels.is_floating_point() or not torch.iinfo(labels.dtype).min:
-        raise TypeError(f"labels: expected signed integers, got {labels.dtype}; convert them with .long()")
-    straight, _, recorded = undistort(labels[..., None].double(), camera, mode="nearest")  # exact up to 2^53
-    return straight[..., 0].to(labels.dtype).where(recorded, -1)

@@ -107,16 +107,3 @@ class Similarity:
         if origin == ORIGIN and max(abs(x), abs(y), abs(z)) <= FAR_UNITS:
             return self, ORIGIN
         return replace(self, translation=torch.zeros(3)), (x, y, z)
-
-
-def fit_similarity(src: Tensor, dst: Tensor) -> Similarity:  # [N, 3], [N, 3] float64, at least three that span a plane
-    """The similarity with the least sum of |s R src + t - dst|^2, in closed form (Umeyama 1991, by scikit-image).
-
-    Of flat clouds it is the rotation, not the mirror image. A ValueError if no similarity fits.
-    """
-    from skimage.transform import SimilarityTransform  # slow to import, and seldom needed
-
-    fit = SimilarityTransform.from_estimate(src.numpy(), dst.numpy())
-    if not fit or not fit.scale > 0:
-        raise ValueError("dst: expected points that a rotation and a scale can reach, got others; check the pairs")
-    return Similarity.from_matrix(torch.from_numpy(fit.params))

@@ -9,7 +9,7 @@ from pathlib import Path
 from torch import Tensor
 
 from .._files import Names
-from ..cameras.resample import undistort_labels
+from ..cameras import undistort
 from ..scenes import Scene
 from ..scenes.files import some
 from ..scenes.scene import as_taken
@@ -73,11 +73,9 @@ def match_views(scene: Scene, stems: Iterable[str], split: str | None, preferred
         )
     missing = [stem for stem in chosen if stem not in index]
     if missing:
-        raise ValueError(
-            f"truth: expected pictures of the scene ({len(scene)} views), got {some(missing, 3)} too ({len(missing)} of "
-            f"{len(chosen)} are not in it); {Names(place).advice(missing[0])} Else give the scene and the labels of one "
-            "data set"
-        )
+        got = f"{some(missing, 3)} too ({len(missing)} of {len(chosen)} are not in it)"
+        advice = f"{Names(place).advice(missing[0])} Else give the scene and the labels of one data set"
+        raise ValueError(f"truth: expected pictures of the scene ({len(scene)} views), got {got}; {advice}")
     return {stem: index[stem] for stem in chosen}
 
 
@@ -85,10 +83,9 @@ def sized_view(scene: Scene, i: int, size: tuple[int, int]) -> View:
     """A view with a camera of the truth's (height, width); a ValueError if its shape differs by more than a pixel."""
     camera, (height, width) = scene.cameras[i], size
     if abs(camera.width * height - camera.height * width) > max(camera.width + height, camera.height + width):
-        raise ValueError(
-            f"truth: expected {scene.stem(i)!r} in the shape of its picture ({camera.width}x{camera.height}), got "
-            f"{width}x{height}; were the labels made for cropped or turned pictures?"
-        )
+        shape = f"{scene.stem(i)!r} in the shape of its picture ({camera.width}x{camera.height})"
+        advice = "were the labels made for cropped or turned pictures?"
+        raise ValueError(f"truth: expected {shape}, got {width}x{height}; {advice}")
     return View(scene.stem(i), camera.resized(height, width))
 
 
@@ -98,4 +95,8 @@ def labels_of_view(scene: Scene, i: int, labels: Tensor) -> Tensor:  # [h, w] in
     size = int(labels.shape[0]), int(labels.shape[1])
     counted = taken.counted(i, size)
     labels = labels if counted is None else labels.where(counted, -1)
-    return labels if scene.lenses is None else undistort_labels(labels, taken.cameras[i].resized(*size))
+    if scene.lenses is None:
+        return labels
+    lens = taken.cameras[i].resized(*size)
+    straight, _, recorded = undistort(labels[..., None].double(), lens, mode="nearest")  # exact up to 2^53
+    return straight[..., 0].to(labels).where(recorded, -1)

@@ -19,7 +19,7 @@ from .._files import file_stem, folded_name
 from .._rows import check_finite
 from ..cameras.camera import Camera
 from ..cameras.paths import robust_bounds
-from ..cameras.similarity import Similarity, fit_similarity
+from ..cameras.similarity import Similarity
 from .files import SceneError, some
 
 MAX_ERROR = 0.03  # of the cameras' extent: two SfM runs of one scene differ by well below a hundredth
@@ -75,7 +75,7 @@ def align_by_cameras(src: Sequence[Camera], dst: Sequence[Camera]) -> Alignment:
 
     Wrong poses are left out as long as half of the common cameras agree. The rotation is the one that most orientations agree
     on; scale and translation come from the pair of centres that fits most cameras; least squares on the cameras that fit, in
-    place and in orientation, refine all (`fit_similarity`, Umeyama 1991). Intrinsics are not used. Names are compared without
+    place and in orientation, refine all (Umeyama 1991, by scikit-image). Intrinsics are not used. Names are compared without
     folder and suffix ("images/a.JPG" is "a.png"), unless names repeat without folders.
 
     Raises:
@@ -161,7 +161,9 @@ def _refine(similarity: Similarity, A: Array, B: Array, turns: Array, size: floa
             shift = B[good].mean(0) - scale * R @ A[good].mean(0)
             similarity = Similarity(scale, torch.from_numpy(R), torch.from_numpy(shift))
         else:
-            similarity = fit_similarity(torch.from_numpy(A[good]), torch.from_numpy(B[good]))
+            from skimage.transform import SimilarityTransform  # slow to import, and seldom needed
+
+            similarity = Similarity.from_matrix(SimilarityTransform.from_estimate(A[good], B[good]).params)
         errors, angles = _errors(similarity, A, B, turns)
         limit, before = min(MAX_ERROR * size, SIGMAS * float(np.median(errors[good])) + ROUNDING * size), good
     return similarity, good

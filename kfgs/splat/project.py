@@ -74,10 +74,10 @@ def project(
         The compiled code has no gradients of gradients, and none in the camera: if `camera.viewmat` or `camera.K`
         requires one, kornia's functions are used.
     """
+    refuse_distortion(camera)
     near = camera.near if near is None else near
     check_range("near", near, 0, closed=(False, False))
     check_range("low_pass", low_pass, 0, closed=(True, False))
-    refuse_distortion(camera)
     camera = camera.with_origin(gaussians.origin)
     if any(m.dtype != gaussians.means.dtype or m.device != gaussians.means.device for m in (camera.viewmat, camera.K)):
         camera = camera.to(gaussians.means)

@@ -11,6 +11,7 @@ from torch import Tensor
 from .._card import html_card, short_value
 from .._check import as_array
 from ..cameras import Camera, Cameras, as_cameras
+from ..cameras.camera import check_camera
 from ..gaussians import Gaussians, check_gaussians
 from .engines import composite, rank_channels
 from .engines.contract import Engine, Ranked
@@ -146,7 +147,7 @@ def rasterize_labels(
 
     Args:
         gaussians: with finite scores as `features`.
-        camera: as in `rasterize`.
+        camera: a single one, a pinhole.
         top: how many classes are kept, from 1 to C.
         early: for labels alone, in about two thirds of the time: with `top` 1 an engine may stop at a pixel as soon as its
             label is certain. Its score and opacity are then those reached so far. The CPU engine does so for up to 26 classes.
@@ -212,10 +213,7 @@ def rank_votes(gaussians: Gaussians, camera: Camera, votes: Votes, top: int = 1,
 
 def _check_arguments(gaussians: Gaussians, camera: Camera) -> None:
     check_gaussians(gaussians)
-    if not isinstance(camera, Camera):
-        raise TypeError(
-            f"camera: expected a Camera, got {type(camera).__name__}; take one of scene.cameras, or from_kornia's"
-        )
+    check_camera(camera)
     means = gaussians.means
     shown = "sh" if gaussians.features is None else "features"
     for name in ("quats", "scales", "opacities", shown):

@@ -16,8 +16,8 @@ def transform_gaussians(gaussians: Gaussians, similarity: Similarity | Se3 | Ten
     """Move, turn and resize a cloud: x' = s R x + t. Cameras that move along see the same picture.
 
     Means move, quaternions are turned (q' = q_R q, keeping their length), scales grow by s, spherical harmonics turn with
-    R (`rotate_sh`). Opacities, features and labels stay as they are. dtype and device are kept; differentiable. A rigid motion
-    may also be kornia's `Se3`, or a matrix [4, 4].
+    R (`rotate_sh`). Opacities, features and labels stay as they are. dtype and device are kept; differentiable in the Gaussians,
+    not in the motion. A rigid motion may also be kornia's `Se3`, or a matrix [4, 4].
 
     Raises:
         TypeError: if an argument is something else.

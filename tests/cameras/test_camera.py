@@ -6,16 +6,7 @@ import pytest
 import torch
 from messages import refused
 
-from kfgs.cameras import (
-    Camera,
-    Distortion,
-    Orbit,
-    Similarity,
-    orbit_cameras,
-    project_points,
-    robust_bounds,
-    undistort,
-)
+from kfgs.cameras import Camera, Distortion, Orbit, Similarity, orbit_cameras, project_points, robust_bounds, undistort
 from kfgs.cameras.camera import view_named
 
 K = torch.tensor([[70.0, 0.0, 50.0], [0.0, 66.0, 30.5], [0.0, 0.0, 1.0]])
@@ -30,9 +21,7 @@ def changed(matrix, row, column, value):
 def test_center_maps_to_the_origin_of_the_camera():
     rotation = pycolmap.Rotation3d(np.array([0.1, -0.2, 0.3, 0.9]) / np.linalg.norm([0.1, -0.2, 0.3, 0.9]))
     pose = pycolmap.Rigid3d(rotation, np.array([0.5, -1.0, 2.0]))
-    viewmat = torch.eye(4, dtype=torch.float64)
-    viewmat[:3] = torch.from_numpy(pose.matrix())
-    camera = Camera(viewmat, K.double(), 96, 64)
+    camera = Camera(pose, K.double(), 96, 64)
     expected = torch.from_numpy(pose.inverse().translation)
     torch.testing.assert_close(camera.center, expected)
     assert (camera.viewmat[:3, 3] - expected).norm() > 1  # the wrong reading: the translation is not the position
@@ -121,7 +110,9 @@ def test_a_camera_shows_itself_in_one_line():
     camera = Camera.look_at((0, -4, 0.5), (0, 0, 0.5), fov_degrees=90, width=64, height=48, name="a.png")
     assert repr(camera) == "Camera('a.png', 64x48, fov 90.0, at (0, -4, 0.5))"
     lens = Distortion("brown_conrady", (-0.1, 0, 0, 0))
-    assert repr(replace(camera, distortion=lens)).endswith("), brown_conrady)")
+    trained = replace(camera, K=camera.K.clone().requires_grad_(), distortion=lens)
+    assert repr(trained).endswith("), brown_conrady)")
+    assert [getattr(trained, name) for name in ("fx", "fy", "cx", "cy")] == [24, 24, 32, 24]
 
 
 def test_matrices_may_be_arrays_or_lists():

@@ -5,6 +5,7 @@ import numpy as np
 import pycolmap
 import pytest
 import torch
+from cases_splat import gaussians_before
 from kornia.geometry.camera import PinholeCamera
 from kornia.geometry.liegroup import Se3, So3
 from kornia.geometry.pose import NamedPose
@@ -12,11 +13,13 @@ from kornia.geometry.quaternion import Quaternion
 from kornia.geometry.vector import Vector3
 from kornia.image import ImageSize
 from kornia.sensors.camera import CameraModel, CameraModelType
-from messages import refused, tells
+from messages import refused
 from oracles_cameras import HEIGHT, LENSES, WIDTH, colmap_camera, colmap_pixels, project_pinhole
 
-from kfgs.cameras import Camera, Distortion, Similarity, from_kornia, project_points, to_kornia
-from kfgs.cameras.projection import camera_to_pixel, unproject_depth, world_to_camera
+from kfgs.cameras import Camera, Distortion, Similarity, from_kornia, project_points, to_kornia, undistort
+from kfgs.cameras.projection import as_cameras, camera_to_pixel, unproject_depth, world_to_camera
+from kfgs.splat import project, rasterize_labels
+from kfgs.viz import look_through
 
 K = torch.tensor([[70.0, 0.0, 50.0], [0.0, 66.0, 30.5], [0.0, 0.0, 1.0]], dtype=torch.float64)
 QUAT_XYZW = np.array([0.1, -0.2, 0.3, 0.9]) / np.linalg.norm([0.1, -0.2, 0.3, 0.9])
@@ -24,9 +27,7 @@ POSE = pycolmap.Rigid3d(pycolmap.Rotation3d(QUAT_XYZW), np.array([0.5, -1.0, 2.0
 
 
 def posed(distortion=None, dtype=torch.float64):
-    viewmat = torch.eye(4, dtype=torch.float64)
-    viewmat[:3] = torch.from_numpy(POSE.matrix())
-    return Camera(viewmat.to(dtype), K.to(dtype), WIDTH, HEIGHT, "posed", distortion)
+    return Camera(POSE, K, WIDTH, HEIGHT, "posed", distortion).to(dtype)
 
 
 def lens_camera(model):
@@ -151,8 +152,7 @@ def test_gradcheck(model):
 def test_moving_world_and_camera_together_changes_nothing():
     _, world = points_in_front()
     camera, points = posed(), torch.from_numpy(world)
-    motion = torch.eye(4, dtype=torch.float64)
-    motion[:3] = torch.from_numpy(pycolmap.Rigid3d(pycolmap.Rotation3d([0.5, 0.5, -0.5, 0.5]), [3, 1, -2]).matrix())
+    motion = Camera(pycolmap.Rigid3d(pycolmap.Rotation3d([0.5, 0.5, -0.5, 0.5]), [3, 1, -2]), K, 1, 1).viewmat
     moved = Camera(camera.viewmat @ torch.linalg.inv(motion), K, WIDTH, HEIGHT)
     there = points @ motion[:3, :3].T + motion[:3, 3]
     for ours, theirs in zip(project_points(camera, points), project_points(moved, there), strict=True):
@@ -167,14 +167,12 @@ def test_refusals():
     refused(lambda: project_points(camera, points, near=-1), "near:", "got -1")
     refused(lambda: unproject_depth(bent, torch.ones(camera.size)), "camera:", "got brown_conrady", "'posed'")
     refused(lambda: unproject_depth(camera, torch.ones(WIDTH, HEIGHT)), "depth:", "[64, 96]", "got (96, 64)")
-    with pytest.raises(TypeError, match=tells("depth:", "got torch.int32")):
-        unproject_depth(camera, torch.ones(camera.size, dtype=torch.int32))
+    refused(lambda: unproject_depth(camera, torch.ones(HEIGHT, WIDTH).int()), "depth:", "torch.int32", error=TypeError)
 
 
 # kornia's cameras
 
-OTHER = torch.eye(4).double()
-OTHER[:3] = torch.from_numpy(pycolmap.Rigid3d(pycolmap.Rotation3d([0.6, 0.0, 0.0, 0.8]), [-0.4, 0.3, 1.0]).matrix())
+OTHER = pycolmap.Rigid3d(pycolmap.Rotation3d([0.6, 0.0, 0.0, 0.8]), [-0.4, 0.3, 1.0])
 CAMERAS = [posed(), Camera(OTHER, K * torch.tensor([[1.3], [1.3], [1]]), 80, HEIGHT, "b.png")]
 
 
@@ -182,9 +180,8 @@ def test_kornia_projects_to_the_pixels_of_kfgs_and_lifts_them_again():
     cam = torch.from_numpy(points_in_front()[0])
     world = torch.stack([(cam - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3] for camera in CAMERAS])
     pixels, depths, _ = project_points(to_kornia(CAMERAS), world)
-    assert all(
-        map(torch.equal, project_points(CAMERAS, world[0])[0], [project_points(c, world[0])[0] for c in CAMERAS])
-    )
+    alone = torch.stack([project_points(camera, world[0])[0] for camera in CAMERAS])
+    assert project_points(CAMERAS, world[0])[0].equal(alone)
     torch.testing.assert_close(to_kornia(CAMERAS).project(world), pixels, rtol=0, atol=1e-9)
     torch.testing.assert_close(to_kornia(CAMERAS).unproject(pixels, depths[..., None]), world, rtol=0, atol=1e-12)
     assert (pixels[0] - project_points(CAMERAS[1], world[0])[0]).norm(dim=1).max() > 1  # the other camera's
@@ -194,17 +191,34 @@ def test_kornia_projects_to_the_pixels_of_kfgs_and_lifts_them_again():
 
 
 @pytest.mark.parametrize("model", [None, *LENSES])
-def test_kornias_model_of_a_lens_gives_the_same_pixels_and_comes_back(model):
+def test_kornias_model_of_a_lens_gives_the_same_pixels(model):
     camera = posed() if model is None else replace(lens_camera(model), viewmat=posed().viewmat)
     local = points_in_front()[0]
     expected = project_points(replace(camera, viewmat=torch.eye(4)), torch.from_numpy(local))[0]
     torch.testing.assert_close(camera.model.project(Vector3(torch.from_numpy(local))).data, expected)
-    pose = NamedPose(camera.pose, "world", "camera")
-    for [again] in (from_kornia(camera.model, camera.pose), from_kornia(camera.model, pose)):
-        torch.testing.assert_close((again.viewmat.detach(), again.K), (camera.viewmat, camera.K))
-        world = torch.from_numpy(points_in_front()[1])
-        torch.testing.assert_close(project_points(again, world)[0].detach(), project_points(camera, world)[0])
-        assert again.size == camera.size
+
+
+@pytest.mark.parametrize("model", [None, *LENSES])
+def test_models_and_poses_of_a_batch_are_taken_row_by_row(model):
+    lens = None if model is None else lens_camera(model).distortion
+    half = lens and replace(lens, coefficients=tuple(k / 2 for k in lens.coefficients))
+    cameras = [posed(lens), replace(posed(half), viewmat=OTHER, K=K * torch.tensor([[1.3], [1.3], [1]]))]
+    kind = {None: "PINHOLE", "OPENCV_FISHEYE": "KANNALA_BRANDT_K3"}.get(model, "BROWN_CONRADY")
+    params = torch.stack([camera.model.params for camera in cameras])
+    first, both = (CameraModel(ImageSize(HEIGHT, WIDTH), CameraModelType[kind], p) for p in (params[0], params))
+    poses = torch.stack([camera.viewmat for camera in cameras])
+    world = torch.from_numpy(points_in_front()[1])
+    for pinhole, pose, expected in (
+        (both, Se3.from_matrix(poses), cameras),
+        (both, OTHER, [replace(camera, viewmat=OTHER) for camera in cameras]),
+        (first, NamedPose(cameras[0].pose, "world", "camera"), cameras[:1]),
+        (first, poses, [replace(cameras[0], viewmat=camera.viewmat) for camera in cameras]),
+    ):
+        views = from_kornia(pinhole, pose)
+        assert [view.size for view in views] == [camera.size for camera in expected]
+        pairs = (project_points(cameras, world) for cameras in (views, expected))
+        torch.testing.assert_close(*pairs, check_dtype=False)
+    refused(lambda: from_kornia(both, poses[[0, 1, 1]]), "pose:", "[2, 4, 4]", "got (3, 4, 4)")
 
 
 def test_poses_of_kornia_are_matrices_of_kfgs():
@@ -216,6 +230,10 @@ def test_poses_of_kornia_are_matrices_of_kfgs():
         assert Camera(pose, K, WIDTH, HEIGHT).R.equal(R)
         torch.testing.assert_close(Similarity.from_matrix(pose).matrix(), step.matrix())
     torch.testing.assert_close(step.pose.matrix(), step.matrix())
+    back = NamedPose(Se3(turn, shift), "world", "camera").inverse()
+    for wrong in (lambda: Camera(back, K, WIDTH, HEIGHT), lambda: from_kornia(posed().model, back)):
+        refused(wrong, "pose:", "from the world", ".inverse()")
+    refused(lambda: Camera(posed(), K, WIDTH, HEIGHT), "viewmat:", "got Camera", error=TypeError)
     refused(lambda: Similarity(2.0, R, shift).pose, "scale: expected 1", "got 2")
 
 
@@ -224,11 +242,24 @@ def test_what_kornia_cannot_hold_is_refused():
     refused(lambda: to_kornia([CAMERAS[0], bent]), "camera:", "got kannala_brandt", "'b.png'")
     refused(lambda: to_kornia([]), "cameras:", "got none")
     assert len(to_kornia(camera for camera in CAMERAS).height) == 2
+    assert [view.size for view in as_cameras([to_kornia(CAMERAS), posed()])] == [c.size for c in (*CAMERAS, posed())]
     refused(lambda: to_kornia([None]), "cameras:", "got NoneType", "from_kornia", error=TypeError)
     flat = CameraModel(ImageSize(4, 4), CameraModelType.ORTHOGRAPHIC, torch.ones(4))
     refused(lambda: from_kornia(flat), "pinhole:", "perspective", "Orthographic", error=TypeError)
-    pinhole = to_kornia(CAMERAS)
+    pinhole, points = to_kornia(CAMERAS), torch.ones(3, 5, 3)
+    refused(lambda: from_kornia(pinhole, torch.eye(4)), "pose:", "None", "extrinsics")
+    refused(lambda: project_points([], points[0]), "cameras:", "got none")
+    refused(lambda: project_points(CAMERAS, points), "points (of 2 cameras):", "[2, N, 3]", "got (3, 5, 3)")
+    cloud = gaussians_before(CAMERAS[0], 3, seed=0)
+    for single in (
+        lambda: unproject_depth(pinhole, torch.ones(HEIGHT, WIDTH)),
+        lambda: undistort(torch.ones(HEIGHT, WIDTH, 3), pinhole),
+        lambda: project(cloud, pinhole),
+        lambda: rasterize_labels(cloud, pinhole),
+        lambda: look_through(None, pinhole),
+    ):
+        refused(single, "camera:", "got PinholeCamera", "from_kornia", error=TypeError)
     stacked = PinholeCamera(pinhole.intrinsics[:, None], pinhole.extrinsics[:, None], pinhole.height, pinhole.width)
     refused(lambda: from_kornia(stacked), "pinhole.intrinsics:", "[2, 4, 4]", "got (2, 1, 4, 4)")
-    with pytest.raises(ValueError, match=tells("width:", "got 28.")):
-        from_kornia(to_kornia(CAMERAS[:1]).scale(torch.tensor([0.3], dtype=torch.float64)))
+    small = to_kornia(CAMERAS[:1]).scale(torch.tensor([0.3], dtype=torch.float64))
+    refused(lambda: from_kornia(small), "width:", "got 28.")

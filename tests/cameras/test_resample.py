@@ -66,6 +66,8 @@ def test_channels_first_are_noticed_and_turned():
     assert torch.equal(map, from_bchw(batch[0]))
     assert torch.equal(map[3, 5], batch[0, :, 3, 5])
     assert torch.equal(to_bchw(map), batch)
+    odd = torch.rand(60, 40, 30)  # channels last, and its last two axes happen to have the new aspect
+    refused(lambda: resize_map(odd, (64, 48)), "map:", "got (60, 40, 30)", "kornia's resize of to_bchw(map)")
     refused(lambda: from_bchw(batch.repeat(2, 1, 1, 1)), "batch:", "[1, D, H, W]", "got (2, 8, 34, 46)")
     for shape, size in (
         ((34, 46, 8), (68, 92)),

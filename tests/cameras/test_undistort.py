@@ -4,12 +4,11 @@ import kornia.geometry
 import numpy as np
 import pytest
 import torch
-from messages import refused, tells
+from messages import refused
 from oracles_cameras import HEIGHT, LENSES, WIDTH, colmap_camera, colmap_pixels, pixel_rays
 
 from kfgs.cameras import Camera, Distortion, undistort
 from kfgs.cameras.projection import fold_radius, plane_to_pixel
-from kfgs.cameras.resample import undistort_labels
 
 
 def camera_of(model, dtype=torch.float64):
@@ -78,12 +77,11 @@ def test_kornia_needs_the_shift_to_integer_centers(model):
 
 def test_pinhole_returns_what_came():
     camera = Camera(torch.eye(4), camera_of("OPENCV").K.float(), WIDTH, HEIGHT)
-    picture, labels = coordinates(torch.float32), torch.ones(HEIGHT, WIDTH, dtype=torch.int64)
+    picture = coordinates(torch.float32)
     result, same, mask = undistort(picture, camera)
     assert torch.equal(result, picture)
     assert same is camera
     assert mask.all()
-    assert torch.equal(undistort_labels(labels, camera), labels)
 
 
 def test_smaller_feature_map_with_the_resized_camera():
@@ -109,26 +107,17 @@ def test_folded_rays_count_as_unrecorded():
 
 @pytest.mark.parametrize("model", ["OPENCV", "OPENCV_FISHEYE"])
 def test_labels_come_from_the_nearest_pixel(model):
-    labels = torch.arange(HEIGHT * WIDTH).reshape(HEIGHT, WIDTH)
-    result = undistort_labels(labels, camera_of(model))
+    labels = torch.arange(HEIGHT * WIDTH).reshape(HEIGHT, WIDTH, 1)
+    result, _, mask = undistort(labels.double(), camera_of(model), mode="nearest")
     positions = colmap_positions(model)
-    _, _, mask = undistort(torch.ones(HEIGHT, WIDTH, 1, dtype=torch.float64), camera_of(model))
     expected = np.floor(positions[..., 1]) * WIDTH + np.floor(positions[..., 0])
-    assert np.array_equal(result.numpy()[mask.numpy()], expected[mask.numpy()])
-    assert (result[~mask] == -1).all()
+    assert np.array_equal(result[mask][:, 0].numpy(), expected[mask.numpy()])
 
 
 def test_undistort_refusals():
     camera = camera_of("OPENCV")
     refused(lambda: undistort(torch.zeros(WIDTH, HEIGHT, 3), camera), "image:", "[64, 96, C]", "got (96, 64, 3)")
-    with pytest.raises(TypeError, match=tells("image:", "got torch.uint8", ".float()")):
-        undistort(torch.zeros(HEIGHT, WIDTH, 3, dtype=torch.uint8), camera)
-    with pytest.raises(ValueError, match=tells("labels:", "[64, 96]", "got (64, 96, 1)")):
-        undistort_labels(torch.zeros(HEIGHT, WIDTH, 1, dtype=torch.int64), camera)
-    with pytest.raises(TypeError, match=tells("labels:", "got torch.float32")):
-        undistort_labels(torch.zeros(HEIGHT, WIDTH), camera)
-    with pytest.raises(TypeError, match=tells("labels:", "signed", "torch.uint8", ".long()")):
-        undistort_labels(torch.zeros(HEIGHT, WIDTH, dtype=torch.uint8), camera)
+    refused(lambda: undistort(coordinates().byte(), camera), "image:", "got torch.uint8", ".float()", error=TypeError)
 
 
 K = torch.tensor([[70.0, 0.0, 50.0], [0.0, 66.0, 30.5], [0.0, 0.0, 1.0]], dtype=torch.float64)
@@ -140,6 +129,8 @@ def test_each_fisheye_coefficient_in_closed_form(i):
     coefficients = [0.0] * 4
     coefficients[i] = -1 / (2 * i + 3)
     assert fold_radius(Distortion("kannala_brandt", tuple(coefficients))) == pytest.approx(math.tan(1))
+    # theta - theta^3 / 12 turns at 2 radians, which no ray in front of the camera reaches
+    assert fold_radius(Distortion("kannala_brandt", (-1 / 12, 0, 0, 0))) == math.inf
 
 
 @pytest.mark.parametrize(("i", "value"), [(0, -1 / 3), (1, -1 / 5), (4, -1 / 7), (5, 1.0), (6, 1 / 3), (7, 1 / 5)])
@@ -150,13 +141,6 @@ def test_each_radial_coefficient_in_closed_form(i, value):
     assert fold_radius(Distortion("brown_conrady", tuple(coefficients))) == pytest.approx(1)
     tangential = tuple(0.01 if j in (2, 3) else k for j, k in enumerate(coefficients))
     assert fold_radius(Distortion("brown_conrady", tangential)) == pytest.approx(1)  # p1, p2 are left out
-
-
-def test_fisheye_fold_in_closed_form():
-    # theta - theta^3 turns at theta = 1 / sqrt(3)
-    assert fold_radius(Distortion("kannala_brandt", (-1.0, 0, 0, 0))) == pytest.approx(math.tan(1 / math.sqrt(3)))
-    # theta - theta^3 / 12 turns at 2 radians, which no ray in front of the camera reaches
-    assert fold_radius(Distortion("kannala_brandt", (-1 / 12, 0, 0, 0))) == math.inf
 
 
 @pytest.mark.parametrize(
