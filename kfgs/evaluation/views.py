@@ -67,10 +67,8 @@ def match_views(scene: Scene, stems: Iterable[str], split: str | None, preferred
     if split is None:
         chosen = chosen or stems
     elif not chosen:
-        raise ValueError(
-            f"split: expected one whose views have ground truth, got {split!r}: none of its {len(wanted)} views is among "
-            f"the {len(stems)} pictures with truth; choose another"
-        )
+        got = f"{split!r}: none of its {len(wanted)} views is among the {len(stems)} pictures with truth"
+        raise ValueError(f"split: expected one whose views have ground truth, got {got}; choose another")
     missing = [stem for stem in chosen if stem not in index]
     if missing:
         got = f"{some(missing, 3)} too ({len(missing)} of {len(chosen)} are not in it)"
