@@ -48,10 +48,8 @@ def test_a_run_remembers_its_scene_and_its_score_is_the_protocols(run, words, as
     assert said == str(expected)
     kept = json.loads((tmp_path / "s.json").read_text())
     assert kept["scores"] == dict(expected.scores)
-    assert (kept["protocol"], kept["options"]) == (
-        "kfgs-pooled/1",
-        {"level": 0, "merged": [], "most": None, "labels": "own"},
-    )
+    assert kept["protocol"] == "kfgs-pooled/1"
+    assert kept["options"] == {"level": 0, "merged": [], "most": None, "labels": "own"}
     assert kept["machine"]
     assert kept["command"] == " ".join(typed)
 
@@ -98,6 +96,8 @@ def test_the_rule_for_labels_is_that_of_the_protocol_unless_asked(run, room, wor
     published, own = (evaluate(run, question, encode=words, labels=rule) for rule in (None, "own"))
     assert (published.options["labels"], published.changed) == ("nearest", ("texts",))
     assert (own.options["labels"], own.changed) == ("own", ("texts", "labels"))
+    papers = evaluate(run, open_question(room, "df3dgs"), encode=words)
+    assert (papers.options["labels"], papers.changed) == ("paper", ())
     method = FieldMethod(field, rule="nearest")
     pooled = open_question(room)
     assert evaluate(method, pooled, encode=words).options["labels"] == "nearest"  # its rule, unless one is asked

@@ -124,7 +124,7 @@ class FieldMethod:
     levels = 1
 
     def __init__(self, field: SemanticField, name: str | None = None, *, rule: LabelRule = "own") -> None:
-        check_choice("labels", rule, get_args(LabelRule))
+        check_choice("rule", rule, get_args(LabelRule))
         self.field, self.rule = field, rule
         self._asked = field.paper if rule == "paper" else field
         self.name = f"kfgs {field.decoder.name}" if name is None else name

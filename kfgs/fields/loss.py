@@ -93,7 +93,7 @@ def at_one_size(rendered: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:  # [
     """
     check_shapes(("rendered", rendered, ("H", "W", target.shape[2])))  # compiled code would read beyond the smaller one
     for axis in (0, 1):
-        if (times := -(-rendered.shape[axis] // (MOST * target.shape[axis]))) > 1:
+        if (times := -(-rendered.shape[axis] // max(1, MOST * target.shape[axis]))) > 1:
             target = target.repeat_interleave(times, dim=axis)
     return resize_map(rendered, (target.shape[0], target.shape[1])), target
 

@@ -98,7 +98,7 @@ def evaluate(
         question: from `open_question`; several results can be asked the same.
         encode: a label set, or the teacher's text encoder. Not needed for colours. `feature3dgs-teacher/1` asks the classes of
             a label set, and LSeg's words of a text encoder.
-        labels: who decides the class of a field's pixel (`rule` of `FieldMethod`). None: own in kfgs's protocols, else nearest.
+        labels: who decides the class of a field's pixel (`rule` of `FieldMethod`). None: the protocol's (`rule`).
         command: kept in the report.
 
     Raises:

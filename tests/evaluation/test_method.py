@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
-from cases_quant import first_channels
+from cases_quant import made_autoencoder
 from messages import refused
 
 from kfgs import Camera, Gaussians
@@ -19,21 +19,22 @@ ROWS = torch.nn.functional.normalize(
 VIEW = View("a", Camera(torch.eye(4), torch.tensor([[40.0, 0, 20], [0, 40, 8], [0, 0, 1]]), 40, 16))
 
 
-def _field(mode: str) -> SemanticField:
+def _field(mode: str, size: float = 0.1) -> SemanticField:
     """Three balls side by side with the features e0, e1, e2 at columns 10, 20, 30; the last ball of four knows nothing."""
     features = torch.cat([torch.eye(3, DIM) * torch.tensor([[1.0], [2.0], [0.5]]), torch.zeros(1, DIM)])
     decoder = Identity(DIM)
     if mode == "fused":
-        decoder = Linear(torch.eye(DIM, 4))
-        features = features[:, :4]
+        decoder, features = Linear(torch.eye(DIM, 4)), features[:, :4]
     if mode in ("codebook", "autoencoder"):
         decoder = Codewords(Codebook(torch.eye(3, DIM) * 3))
     if mode == "autoencoder":
-        autoencoder = first_channels(4, DIM, high=3.0)
+        out = torch.eye(DIM, 4) * torch.tensor([3.0, 1, 1, 1]), torch.zeros(DIM)  # mixed latents decode towards e0
+        layers = ((torch.eye(4, DIM), torch.zeros(4)),), (out, (torch.eye(DIM), torch.zeros(DIM)))
+        autoencoder = made_autoencoder(*layers, 0.0, 3.0)
         decoder = Autoencoded(decoder.codebook, autoencoder)
         features = torch.cat([autoencoder.encode(torch.eye(3, DIM) * 3).detach(), torch.zeros(1, 4)])
     means = torch.tensor([[-1.25, 0, 5], [0, 0, 5], [1.25, 0, 5], [50, 0, 5]])
-    cloud = Gaussians(means, torch.eye(4)[:1].repeat(4, 1), torch.full((4, 3), 0.1), torch.full((4,), 0.9), features)
+    cloud = Gaussians(means, torch.eye(4)[:1].repeat(4, 1), torch.full((4, 3), size), torch.full((4,), 0.9), features)
     return SemanticField(cloud, decoder)
 
 
@@ -53,9 +54,10 @@ def test_a_field_answers_with_the_cosines_of_what_is_seen(mode):
 
 @pytest.mark.parametrize("mode", ["plain", "fused", "autoencoder"])
 def test_a_field_labels_pixels_as_segment_does(mode):
-    field = _field(mode)
+    field = _field(mode, 0.5)  # the balls overlap
     assert torch.equal(label_view(FieldMethod(field), VIEW, ROWS), field.segment(VIEW.camera, ROWS))
     printed = field.paper.segment(VIEW.camera, ROWS)
+    assert torch.equal(printed, field.segment(VIEW.camera, ROWS)) == (mode == "plain")
     assert torch.equal(label_view(FieldMethod(field, rule="paper"), VIEW, ROWS), printed)
     plain = FieldMethod(field, "x", rule="nearest")
     assert torch.equal(label_view(plain, VIEW, ROWS), best_labels(plain.cosines(VIEW, ROWS)[0]))

@@ -93,6 +93,8 @@ def test_maps_of_other_channels_are_refused(measure, channels):
     a, _ = pictures()
     with pytest.raises(ValueError, match=rf"rendered: expected \[H, W, {channels}\]"):
         measure(a, a[..., 0], torch.zeros(23, 31, channels, dtype=a.dtype))
+    with pytest.raises(ValueError, match=r"\(height\).* got 0"):
+        measure(a, a[..., 0], torch.zeros(0, 40, 3, dtype=a.dtype))
 
 
 @pytest.mark.parametrize("measure", [l1_loss, ColorLoss()])
