@@ -80,11 +80,7 @@ class Report:
 
 
 def make_report(
-    protocol: Any,
-    method: str,
-    scores: Mapping[str, float],
-    rows: Sequence[Row],
-    notes: Sequence[str] = (),
+    protocol: Any, method: str, scores: Mapping[str, float], rows: Sequence[Row], notes: Sequence[str] = ()
 ) -> Report:
     """The report of a protocol: a frozen dataclass with `name` and `about`, whose fields are its options."""
     options = {option.name: plain(getattr(protocol, option.name)) for option in fields(protocol)}

@@ -75,9 +75,14 @@ class ReadWhenAsked(Mapping[str, T]):
 
 
 def merge_table(names: Sequence[str], merged: Merged) -> Tensor:  # [C + 1] int64
-    """The class that each class counts as, itself by default; -1 at the end, so that `table[labels]` keeps it."""
-    becomes = {old: list(names).index(new) for old, new in merged if new in names}
-    return torch.tensor([*(becomes.get(name, i) for i, name in enumerate(names)), -1])
+    """The class that each class counts as, itself by default; -1 at the end. Names by `name_key`, chains are followed."""
+    keys, table = [name_key(name) for name in names], [*range(len(names)), -1]
+    becomes = {name_key(old): keys.index(name_key(new)) for old, new in merged if name_key(new) in keys}
+    for _ in becomes:
+        table = [becomes.get(keys[i], i) if i >= 0 else i for i in table]
+    if any(keys[i] in becomes for i in table[:-1]):
+        raise ValueError(f"merged: expected pairs (class, what it counts as) without a circle, got {merged}")
+    return torch.tensor(table)
 
 
 def name_key(name: str) -> str:
