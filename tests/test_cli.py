@@ -48,22 +48,25 @@ def test_any_option_of_a_method_is_set_by_its_name(room, tmp_path, capsys):
     changed = Settings(
         steps=3_000, set=("codebook.maximum=50", "training.densify.maximum=none", "autoencoder.latent=12")
     )
-    method = changed.of(kfgs.Paper.paper())
+    method = changed.of(kfgs.Paper.paper(), "--method paper-full")
     assert (method.codebook.maximum, method.autoencoder.latent, method.training.densify.maximum) == (50, 12, None)
     assert (method.training.steps, method.training.densify.stop) == (3_000, 1_500)
     command = ["fit", str(room), "--out", str(tmp_path), "--method", "paper", "--set"]
     for word, shown in (
-        ("alpha=1", "--alpha=1"),
-        ("training.densify.gradient=x", "'x'"),
-        ("codebook.maximum=0", "got 0"),
+        ("alpha=1", "got 'alpha=1'; its groups: codebook, autoencoder, training; did you mean codebook.expand_below?"),
+        ("maximun=1", "did you mean codebook.maximum or training.densify.maximum?"),
+        ("training.densify.gradient=x", "expected training.densify.gradient as float, got"),
+        ("training.densify.maximum=0", "got 0; none is allowed, too"),
+        ("codebook=none", "autoencoder: expected None with codebook=None"),
     ):
-        with pytest.raises(SystemExit):
-            main([*command, word])
-        assert shown in (said := capsys.readouterr().err)
-        assert "--set help lists the names" in said
+        assert main([*command, word]) == 1
+        assert shown in capsys.readouterr().err
     with pytest.raises(SystemExit):
-        main([*command, "help"])
-    assert "--training.densify.gradient FLOAT" in capsys.readouterr().out
+        main(["fit", "--method", "grown", "--set", "help"])
+    assert "\ntraining.densify.gradient=0.0008  A Gaussian" in capsys.readouterr().out
+    adc = Settings(set=("--autoencoder=NONE", "training.rates.means-final=1")).of(kfgs.Paper.paper(), "")
+    assert (adc.autoencoder, adc.training.rates.means_final) == (None, 1.0)
+    assert Settings(set=("codebook=none",)).of(adc, "").codebook is None
 
 
 def test_the_papers_split_by_its_name(room):

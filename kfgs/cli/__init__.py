@@ -29,9 +29,8 @@ from .._card import error_line, short_of_memory
 from .._interrupts import interruptible
 from .ask import select, view
 from .draw import evaluate, render, segment
-from .features import features
 from .files import check_outputs, notes_as_lines, say
-from .fit import batch, color, demo, fit, sfm
+from .fit import batch, color, demo, features, fit, sfm
 from .splats import attach, convert, edit
 
 GROUPS: dict[str, tuple[Any, ...]] = {
@@ -68,6 +67,9 @@ def main(arguments: list[str] | None = None) -> int:
     words = [re.sub("^(--[^=]+=|)~(?=/|$)", lambda start: start[1] + home, word) for word in words]
     name, *given = [word for word in words if word != STRICT] or [""]
     command = COMMANDS.get("convert" if name == "info" else name)  # `kfgs info PATH`: convert without a target
+    if re.search("^--set[ =]help$", "\n".join(given).replace("--set\n", "--set "), re.MULTILINE):  # needs no scene
+        chosen = " ".join(re.findall("--(?:method|preset)[ =][a-z-]+", " ".join(given)))
+        given = ["SCENE", "--out=OUT", "--set=help", *chosen.split()]
     names = {} if command is None else shown_names(command)
     names |= {"classes": names.get("text", "classes"), "folder": names.get("out", "folder")}  # those of functions
 
@@ -78,8 +80,15 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         if os.stat(".").st_nlink == 0:  # torch's libraries would end the process
             raise OSError("expected a working directory, got one that was deleted; change to another (cd)")
-        if command is None:
-            _answer(name)
+        if name == "--version":
+            say(f"kfgs {kfgs.__version__}")
+        elif name in ("-h", "--help"):
+            say(_overview())
+        elif command is None:
+            near = difflib.get_close_matches(name, COMMANDS, n=1)
+            hint = f"did you mean {near[0]!r}?" if near else "`kfgs --help` lists them"
+            say(f"error: expected a command, got {repr(name) if name else 'none'}; {hint}", sys.stderr)
+            raise SystemExit(2)
         elif any(word == "" or re.fullmatch("--[^=]+=", word) for word in given):
             raise ValueError("argument: expected a text, got an empty one; leave it out, or write . for this folder")
         else:
@@ -102,19 +111,6 @@ def main(arguments: list[str] | None = None) -> int:
             raise
         advice = "close other programs, give fewer or smaller inputs, or use a larger machine"
         return failed(f"expected enough memory, but it ran out ({error_line(error)}); {advice}")
-
-
-def _answer(name: str) -> None:
-    """Say what was asked for without a command: the overview, the version, or which command was probably meant."""
-    if name == "--version":
-        say(f"kfgs {kfgs.__version__}")
-    elif name in ("-h", "--help"):
-        say(_overview())
-    else:
-        near = difflib.get_close_matches(name, COMMANDS, n=1)
-        hint = f"did you mean {near[0]!r}?" if near else "`kfgs --help` lists them"
-        say(f"error: expected a command, got {repr(name) if name else 'none'}; {hint}", sys.stderr)
-        raise SystemExit(2)
 
 
 def documented(command: Callable[..., None]) -> Callable[..., None]:

@@ -50,6 +50,7 @@ def select(
     """
     from .._check import check_range
     from ..labels import Selection, number_instances
+    from ..viz.films import show_cloud, show_photos, write_parts
 
     if out is not None:
         check_output("out", out, "a folder")
@@ -82,7 +83,15 @@ def select(
     parts = kfgs.connected_parts(cloud, selection, cameras, distance=distance)
     if out is not None:  # before anything is printed, whose reader may have ended
         facts = {"query": query, "threshold": selection.threshold, "how": selection.how, "count": len(selection)}
-        written = _save(out, facts | {"parts": parts}, cloud, selection, cameras, scene)
+        under = None if cloud.sh is None else show_cloud(cloud, color_by="rgb")
+        under = under if scene is None else show_photos(scene)
+        with atomic_folder(out) as new:
+            write_json(new / "selection.json", facts | {"parts": [part.to_json() for part in parts]})
+            kfgs.write_splats(cloud.select(selection.mask), new / "selection.ply")
+            write_parts(new / "parts.png", cloud, parts, cameras or (), under, query)
+            written = sorted(path.name for path in new.iterdir())
+        for name in {"parts.png", "selection.ply.classes.json"} - set(written):
+            (out / name).unlink(missing_ok=True)  # of an older selection
     say(headline)
     named = not is_field(source) and threshold is None  # parts are numbered as `kfgs edit` does
     for part in parts:
@@ -92,22 +101,6 @@ def select(
         say(f"  {left} smaller part{'s are' if left > 1 else ' is'} not listed")
     if out is not None:
         wrote([out / name for name in written])
-
-
-def _save(folder: Path, facts: dict[str, Any], cloud: Any, selection: Any, cameras: Any, scene: Any) -> list[str]:
-    """Write a selection as numbers (JSON), as Gaussians (PLY), and as a picture of its parts over photographs."""
-    from ..viz.films import show_cloud, show_photos, write_parts
-
-    under = None if cloud.sh is None else show_cloud(cloud, color_by="rgb")
-    under, parts = under if scene is None else show_photos(scene), facts["parts"]
-    with atomic_folder(folder) as new:
-        write_json(new / "selection.json", facts | {"parts": [part.to_json() for part in parts]})
-        kfgs.write_splats(cloud.select(selection.mask), new / "selection.ply")
-        write_parts(new / "parts.png", cloud, parts, cameras or (), under, facts["query"])
-        written = sorted(path.name for path in new.iterdir())
-    for name in {"parts.png", "selection.ply.classes.json"} - set(written):
-        (folder / name).unlink(missing_ok=True)  # of an older selection
-    return written
 
 
 def words_of(classes: Classes, teacher: Teacher, field: Any) -> tuple[Any, Callable[[str], Any] | None]:

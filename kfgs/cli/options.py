@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import ast
+import difflib
+import inspect
 import re
-import sys
-from dataclasses import dataclass, replace
-from functools import cached_property
+from contextlib import suppress
+from copy import deepcopy
+from dataclasses import dataclass, is_dataclass, replace
+from functools import cached_property, reduce
 from pathlib import Path
+from textwrap import fill
 from typing import Annotated, Any, Literal, TypeVar
 
 import tyro
@@ -35,25 +40,69 @@ class Settings:
     """How it is made."""
 
     steps: Given[int] = None
-    """Training steps; the schedule is stretched to them. Those of the method or preset when not given."""
-    set: Several = ()
-    """Any other option of the method, by its name and value, as in "codebook.maximum=50" or "uplift.keep=0.99". May be given
-    several times; --set help lists all of them."""
+    """Training steps, by default those of the method or preset; the schedule is stretched (not by --set training.steps=N)."""
+    set: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="NAME=VALUE")] = ()
+    """Any other option of the method, as in "codebook.maximum=50" or "uplift.max_gaussians=none". May be given several times;
+    --set help lists all of them."""
 
-    def of(self, options: Any) -> Any:
-        """The options of a method with these values; a wrong name or value ends the command, as for any option."""
+    def of(self, options: Any, chosen: str) -> Any:
+        """The options of a method or preset, `chosen` as in "--method paper", with these values."""
         if self.steps is not None:
             color = getattr(options, "color", options)
             color = replace(color, training=color.training.with_steps(self.steps))
             options = color if hasattr(options, "training") else replace(options, color=color)
-        kind, words = type(options), [re.sub("=none$", "=None", f"--{text}") for text in self.set]
-        style = (tyro.conf.AvoidSubcommands, tyro.conf.FlagConversionOff)
-        try:
-            return tyro.cli(kind, default=options, args=words, prog="--set", config=style) if words else options
-        except SystemExit as ended:
-            if ended.code:
-                say("--set help lists the names of all options", sys.stderr)
-            raise
+        if "help" in self.set:
+            say(f"Options of {chosen} and their values for --set; none leaves a whole group out:")
+            lines = [f"{name}={value}  {text}" for name, (_, value, text) in settable(options).items()]
+            say("\n".join(fill(line, 98, subsequent_indent="    ") for line in lines))
+            raise SystemExit(0)
+        options = deepcopy(options)
+        for given in self.set:
+            name, _, text = (part.strip() for part in given.lstrip("-").partition("="))
+            kinds = known_kinds(name := name.replace("-", "_"), options, f"an option of {chosen}, got {given!r}")
+            value: Any = text
+            with suppress(ValueError, SyntaxError):  # otherwise it is a text
+                value = ast.literal_eval(text.title() if text.lower() in ("none", "true", "false") else text)
+            value = float(value) if type(value) is int and "float" in kinds else value
+            if (str(value) if value is None else type(value).__name__) not in kinds:
+                raise ValueError(f"set: expected {name} as {' or '.join(kinds).lower()}, got {given!r}; give one")
+            *groups, field = name.split(".")
+            object.__setattr__(reduce(getattr, groups, options), field, value)  # of the copy
+        known = settable(options)
+        for place in {name[: name.rfind(".") + 1] for name in known}:
+            try:
+                replace(reduce(getattr, place.split(".")[:-1], options))  # checks the values
+            except ValueError as error:
+                kinds, *_ = known.get(f"{place}{error}".partition(": ")[0], ([], "", ""))
+                also = "; none is allowed, too" if "None" in kinds[1:] else ""
+                raise ValueError(f"set: {place}{error}{also}") from error
+        return options
+
+
+def settable(options: Any, place: str = "") -> dict[str, tuple[list[str], str, str]]:
+    """What --set can change, by name: the kinds of its values, the value as it is written, and its text."""
+    known: dict[str, tuple[list[str], str, str]] = {}
+    fields = r'^    (\w+): ([^=\n]+) = .*\n(?:    """((?s:.*?))""")?'  # as written, since only the source has the texts
+    for name, kind, text in re.findall(fields, inspect.getsource(type(options)), re.MULTILINE):
+        value, kinds = getattr(options, name), kind.replace("[int, ...]", "").split(" | ")
+        written = "none" if value is None or is_dataclass(value) else str(value).strip("()").replace(" ", "")
+        kinds = kinds[-1:] if is_dataclass(value) else kinds  # a group can only be left out
+        if set(kinds) <= {"int", "float", "bool", "str", "tuple", "None"}:
+            known[place + name] = (kinds, written, " ".join(text.split()))
+        known |= settable(value, f"{place}{name}.") if is_dataclass(value) else {}
+    return known
+
+
+def known_kinds(name: str, options: Any, wrong: str) -> list[str]:
+    """The kinds of an option's values. A ValueError with the groups and similar names, or those of a symbol of the paper."""
+    known, symbol = settable(options), name.rpartition(".")[2]
+    if name in known:
+        return known[name][0]
+    alike = difflib.get_close_matches(symbol, {full.rpartition(".")[2] for full in known}, n=2)
+    pattern = rf"\({re.escape(symbol)}[,)]"  # (alpha, Eq. 8)
+    near = [n for n in known if n.rpartition(".")[2] in alike or re.search(pattern, known[n][2], re.IGNORECASE)]
+    hint = f"did you mean {' or '.join(near)}?" if near else "--set help lists all"
+    raise ValueError(f"set: expected {wrong}; its groups: {', '.join({n.split('.')[0]: 0 for n in known})}; {hint}")
 
 
 @dataclass(frozen=True)
@@ -90,17 +139,13 @@ class Teacher:
     def load(self, **options: Any) -> Any:
         """Load the teacher, on the GPU if there is one; None if none is named."""
         from ..pipeline.train import training_device
+        from ..teachers.load import check_teacher_name
 
-        self.check()
+        check_teacher_name(self.teacher, self.weights)
         if self.teacher is None:
             return None
         teacher = kfgs.load_teacher(self.teacher, self.weights, **options)
         return teacher.to(training_device()) if hasattr(teacher, "to") else teacher
-
-    def check(self) -> None:
-        """Raise a ValueError if weights are given without their teacher."""
-        if self.teacher is None and self.weights is not None:
-            raise ValueError(f"weights: expected --teacher with it, whose weights they are, got {self.weights} alone")
 
 
 @dataclass(frozen=True)

@@ -43,14 +43,15 @@ class Paper:
     """
 
     codebook: PaperCodebook | GrownCodebook | None = field(default_factory=PaperCodebook)
-    """Adaptive Data Compression (Sec. 3.3.1). None, with `autoencoder=None`: the field is trained on the raw features, the
-    row "just decouple" of Table 1."""
+    """Adaptive Data Compression (Sec. 3.3.1). None, with `autoencoder=None`: raw features, "just decouple" of Table 1."""
     autoencoder: AutoencoderConfig | None = field(default_factory=AutoencoderConfig.paper)
     """Semantic Compression (Sec. 3.3.2). None: a Gaussian has all D channels, the row "decouple+ADC" of Table 1."""
     training: Training = field(default_factory=Training.cpu)
     """Training of the decoupled field (Eq. 4)."""
 
     def __post_init__(self) -> None:
+        if not isinstance(self.codebook, PaperCodebook | GrownCodebook | None):
+            raise TypeError(f"codebook: expected PaperCodebook, GrownCodebook or None, got {self.codebook!r}; pass one")
         if self.codebook is None and self.autoencoder is not None:
             raise ValueError(
                 "autoencoder: expected None with codebook=None, since it learns from codewords, got options; pass None for both"
@@ -74,9 +75,8 @@ class Paper:
 
 def changes(ours: Any, papers: Any, place: str = "") -> Iterator[str]:
     """Options that decide the result and differ from the paper's, as `codebook.maximum=50`."""
-    for name, own in vars(ours).items():
-        printed = getattr(papers, name)
+    for (name, own), printed in zip(vars(ours).items(), vars(papers).values(), strict=True):
         if is_dataclass(own) and type(own) is type(printed):
             yield from changes(own, printed, f"{place}{name}.")
-        elif own != printed and name not in ("report_every", "checkpoint_every"):
+        elif own != printed and name not in ("engine", "report_every", "checkpoint_every"):
             yield f"{place}{name}={own}"

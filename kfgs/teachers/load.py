@@ -58,10 +58,15 @@ def load_teacher(name: str, weights: str | Path | None = None, **options: Any) -
     return loader(weights, **options)
 
 
-def check_teacher_name(name: str) -> None:
-    """Raise a ValueError unless it is one of `teacher_names()`, or `package.module:name`, which is not imported here."""
+def check_teacher_name(name: str | None, weights: object = None) -> None:
+    """Raise a ValueError unless it is one of `teacher_names()`, or `package.module:name`, which is not imported here.
+
+    A name of None is right without weights.
+    """
     names = teacher_names()
-    if ":" not in name and name not in names:
+    if name is None and weights is not None:
+        raise ValueError(f"weights: expected --teacher with it, whose weights they are, got {weights} alone")
+    if name is not None and ":" not in name and name not in names:
         near = difflib.get_close_matches(name.lower(), names, n=1)
         raise ValueError(
             f"teacher: expected one of {', '.join(names)}, or package.module:name of your own, got {name!r}"

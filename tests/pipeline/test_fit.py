@@ -193,6 +193,7 @@ def test_bad_input_is_refused_before_any_work(scene, room, maps, splat, tmp_path
         refused(lambda arguments=arguments: fit(*arguments, folder=tmp_path), *words, error=error)
     refused(lambda: fit(scene, maps, folder=tmp_path, split="val"), "split:", "train, test", "got 'val'")
     refused(lambda: Paper(codebook=None), "autoencoder:", "codebook=None")
+    refused(lambda: Paper(codebook="grown"), "codebook:", "GrownCodebook", "got 'grown'", error=TypeError)
     assert list(tmp_path.iterdir()) == []
 
 
