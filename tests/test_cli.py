@@ -45,19 +45,15 @@ def test_a_scene_without_points_is_told_that_some_are_found(room, tmp_path, caps
 
 
 def test_any_option_of_a_method_is_set_by_its_name(room, tmp_path, capsys):
-    changed = Settings(
-        steps=3_000, set=("codebook.maximum=50", "training.densify.maximum=none", "autoencoder.latent=12")
-    )
+    changed = Settings(3_000, ("codebook.maximum=50", "training.densify.maximum=none", "autoencoder.latent=12"))
     method = changed.of(kfgs.Paper.paper(), "--method paper-full")
     assert (method.codebook.maximum, method.autoencoder.latent, method.training.densify.maximum) == (50, 12, None)
     assert (method.training.steps, method.training.densify.stop) == (3_000, 1_500)
     command = ["fit", str(room), "--out", str(tmp_path), "--method", "paper", "--set"]
     for word, shown in (
         ("alpha=1", "got 'alpha=1'; its groups: codebook, autoencoder, training; did you mean codebook.expand_below?"),
-        ("maximun=1", "did you mean codebook.maximum or training.densify.maximum?"),
         ("training.densify.gradient=x", "expected training.densify.gradient as float, got"),
         ("training.densify.maximum=0", "got 0; none is allowed, too"),
-        ("codebook=none", "autoencoder: expected None with codebook=None"),
     ):
         assert main([*command, word]) == 1
         assert shown in capsys.readouterr().err
