@@ -27,8 +27,8 @@ from torch import Tensor
 from kfgs import SemanticField, attach, load_label_set, load_scene, read_splats
 from kfgs._files import read_json
 from kfgs.cameras import Camera
-from kfgs.cameras.resample import undistort_labels
 from kfgs.evaluation.label_pictures import load_label_map
+from kfgs.evaluation.views import labels_of_view
 from kfgs.gaussians import Gaussians
 from kfgs.labels import EditList, LabelSet, Move, Recolor, Remove, transfer_labels
 from kfgs.scenes import Scene
@@ -99,7 +99,7 @@ def labelled_views(scene: Scene, folder: Path) -> Iterator[tuple[Camera, Tensor]
     """The training views with their label pictures."""
     for i in scene.views("train"):
         labels = load_label_map(folder / f"{scene.stem(i)}.png")
-        yield scene.cameras[i], labels if scene.lenses is None else undistort_labels(labels, scene.lenses[i])
+        yield scene.cameras[i], labels_of_view(scene, i, labels)
 
 
 def toy(demo: Path) -> None:

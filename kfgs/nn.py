@@ -103,9 +103,7 @@ class VectorQuantizer(nn.Module):
         sizes = check_shapes(("features", features, ("B", self.codewords.shape[1], "H", "W")))
         pixels = features.movedim(1, -1)  # [B, H, W, D]
         rows = pixels.detach().reshape(-1, self.codewords.shape[1]).to(self.codewords.dtype)
-        with torch.autocast(
-            features.device.type, enabled=False
-        ):  # in half precision other codewords would be the nearest
+        with torch.autocast(features.device.type, enabled=False):  # half precision finds other codewords
             nearest = nearest_rows(rows, unit_rows(self.codewords.detach())).codeword
         indices = nearest.view(sizes["B"], sizes["H"], sizes["W"])
         straight = self.codewords[indices] + (pixels - pixels.detach())  # the bracket is 0, with a gradient of 1

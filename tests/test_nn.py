@@ -81,7 +81,7 @@ def test_the_quantizer_is_equation_5_with_a_straight_gradient():
         layer.codewords.zero_()
     assert kept.codewords.equal(given)
     assert BOOK.codewords.equal(given)
-    layer, features = VectorQuantizer(torch.randn(200, 6)), torch.randn(2, 6, 30, 40)
+    layer, features = VectorQuantizer(torch.randn(50, 64)), torch.randn(2, 64, 30, 40)
     with torch.autocast("cpu", dtype=torch.bfloat16):  # changes no codeword
         indices = layer(features).indices
     assert indices.equal(layer(features).indices)
