@@ -22,6 +22,7 @@ TABLES = {  # the line above a table, and its panel's title
 NAMES = {
     "kfgs default": "kfgs",
     "decouple + ADC + SC": "DF-3DGS, run by kfgs",
+    "decouple + ADC": "DF-3DGS without SC",
     "just decouple": "DF-3DGS, decouple only",
 }
 
