@@ -107,10 +107,8 @@ class Task:
             classes = LabelSet(tuple(self.names), self.text @ basis)
             return self.score(lambda i: field.paper.segment(self.scene.cameras[i], classes))
         rows = normalize(normalize(book.codewords, dim=1) @ basis, dim=1)
-        classes, labels = (
-            LabelSet(tuple(str(k) for k in range(len(rows))), rows),
-            (book.codewords @ self.text.T).argmax(1),
-        )
+        classes = LabelSet(tuple(map(str, range(len(rows)))), rows)
+        labels = (book.codewords @ self.text.T).argmax(1)
         return self.score(lambda i: labels[field.paper.segment(self.scene.cameras[i], classes)])
 
     def cell(self, kind: str, count: int, name: str) -> dict[str, Any]:

@@ -143,10 +143,8 @@ def uncovered(name: str, pairs: list[tuple[Path, Path]]) -> None:
         for rule, edits in rules.items():
             started = time.perf_counter()
             after = edits.apply(before)
-            seconds, score = (
-                time.perf_counter() - started,
-                score_uncovered(before, after, folder, name, moved=rule == "moved"),
-            )
+            seconds = time.perf_counter() - started
+            score = score_uncovered(before, after, folder, name, moved=rule == "moved")
             row = [score.psnr, score.ssim, score.untouched_pixels, len(after) - len(before), seconds]
             rows.setdefault(rule, []).append(row)
             print(

@@ -17,7 +17,6 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from statistics import mean
@@ -40,6 +39,11 @@ from kfgs.quant.maps import grid_slices
 
 SIZE, CHANNELS, FREQUENT = (360, 480), 24, 10
 STEPS = (500, 1_500, 2_500, 5_000, 10_000, 15_000, 30_000)
+METHODS = {
+    "decouple": Paper.paper(codebook=None, autoencoder=None),
+    "adc": Paper.paper(autoencoder=None),
+    "adc+sc": Paper.paper(),
+}
 ROWS = {"decouple": "just decouple", "adc": "decouple + ADC", "adc+sc": "decouple + ADC + SC"}
 
 
@@ -95,13 +99,11 @@ class Task:
         return principal(self.maps)
 
     def run(self, row: str, seed: int) -> dict[str, Any]:
-        """Fit a row, or go on with it, and score it."""
-        folder, whole = self.args.out / f"{row}-{seed}", Paper.paper()
-        if (folder / "score.json").is_file() or self.args.report:
+        """Fit a row, or continue it, and score it."""
+        folder = self.args.out / f"{row}-{seed}"
+        if (folder / "score.json").is_file():
             return dict(read_json(folder / "score.json"))
-        basis = None if row == "adc+sc" else self.basis
-        method = whole if row == "adc+sc" else replace(whole, autoencoder=None)
-        method = replace(method, codebook=None) if row == "decouple" else method
+        method, basis = METHODS[row], None if row == "adc+sc" else self.basis
         maps = Enlarged(self.maps, basis)
         field = fit(self.scene, maps, method, folder=folder, seed=seed, report=print, progress=False)
         text = normalize(self.classes.embeddings.float(), dim=1)
@@ -118,15 +120,10 @@ class Task:
             "iou": dict(zip(self.classes.names, report.iou.tolist(), strict=True)), "pixels": counts,
             "gaussians": len(field), "by_step": {step: by_step.get(step) for step in STEPS},
             "seconds": field.info["seconds"], "storage": field.storage(),
-            "published_storage": self._published(row, field), "energy": basis is None,
+            "published_storage": field.storage() if basis is None else semantic_storage_bytes(len(field), self.maps.shape[2]),
         }  # fmt: skip
         write_json(folder / "score.json", result)
         return result
-
-    def _published(self, row: str, field: Any) -> int:
-        if row == "adc+sc":
-            return int(field.storage())
-        return semantic_storage_bytes(len(field), self.maps.shape[2])
 
 
 def frequent(result: dict[str, Any]) -> float:
