@@ -36,7 +36,7 @@ def double(x):
 
 
 def decorate(cached_njit):
-    @cached_njit(nogil=True)
+    @cached_njit()
     def kernel(pair, out):
         for i in range(len(out)):
             out[i] = double(pair.left[i]) + pair.right[i]
@@ -149,7 +149,7 @@ def test_another_numba_costs_the_cache_alone(monkeypatch):
         return decorate
 
     monkeypatch.setattr(numba_cache, "njit", other)
-    double = numba_cache.cached_njit(nogil=True)(lambda x: 2 * x)
+    double = numba_cache.cached_njit()(lambda x: 2 * x)
     assert double(21) == 42
     assert double.stats.cache_path is None
 

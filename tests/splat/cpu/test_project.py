@@ -212,7 +212,7 @@ def test_batches_are_vectorised_and_stay_in_float32():
     lens = numba_project_forward.make_lens(Pinhole(torch.eye(4), torch.eye(3), 4, 4, 0.1, 0.3))
     for module, name in ((numba_project_forward, "_project_batch"), (numba_project_backward, "_differentiate_batch")):
         kernel = getattr(module, name)
-        kernel(np.ones(module._STATE, np.float32), lens)
+        kernel.compile((numba.typeof(np.ones(module._STATE, np.float32)), numba.typeof(lens)))
         (text,) = (t for s, t in kernel.inspect_asm().items() if s[0].dtype == numba.float32)
         packed = len(re.findall(r"\bv?(?:mulps|fn?m(?:add|sub)\d+ps)\b", text))
         single = len(re.findall(r"\bv?(?:mulss|fn?m(?:add|sub)\d+ss)\b", text))

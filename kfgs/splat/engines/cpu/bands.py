@@ -5,11 +5,10 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 
 from . import narrow as narrow
 from . import wide as wide
-from .cache import cached_njit
+from .cache import cached_njit, inner_njit
 from .simd import (
     LANES,
     add_outer,
@@ -29,8 +28,6 @@ from .square import (
     BLOCKS,
     CHUNK,
     FINAL,
-    INLINE,
-    OPTIONS,
     PIXELS,
     Rows,
     View,
@@ -60,7 +57,7 @@ class Trace(NamedTuple):
     drawn: Any  # int32, for each square and Gaussian of its list the blocks in which it was drawn, as bits
 
 
-@njit(**INLINE)
+@inner_njit(forceinline=True)
 def read_block(picture: Picture, box: Any, block: int, channel: int, into: Any, place: int, stride: int) -> None:
     """Copy LANES channels of a block's pixel p to into[place + p * stride:]; 0 beyond the box and the last channel."""
     values, width, channels = picture
@@ -75,7 +72,7 @@ def read_block(picture: Picture, box: Any, block: int, channel: int, into: Any, 
             store(into, place + (y * BLOCK_SIDE + x) * stride, load_part(values, at + x * channels, wanted))
 
 
-@njit(**INLINE)
+@inner_njit(forceinline=True)
 def write_block(picture: Picture, box: Any, block: int, channel: int, source: Any, place: int, stride: int) -> None:
     """The inverse of `read_block`: writes nothing outside of the box or beyond the last channel."""
     values, width, channels = picture
@@ -88,7 +85,7 @@ def write_block(picture: Picture, box: Any, block: int, channel: int, source: An
             store_part(values, at + x * channels, lanes, vector)
 
 
-@cached_njit(**OPTIONS)
+@cached_njit()
 def composite_band(
     band: int,
     view: View,
@@ -145,7 +142,7 @@ def composite_band(
                         store_part(maps, pixel * channels + channel, lanes, value)
 
 
-@cached_njit(**OPTIONS)
+@cached_njit()
 def accumulate_band(
     band: int,
     view: View,

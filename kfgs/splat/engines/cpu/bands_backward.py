@@ -4,19 +4,15 @@ from __future__ import annotations
 
 from typing import Any
 
-from numba import njit
-
 from . import narrow as narrow
 from . import wide as wide
 from .bands import SIXTEEN, Picture, Trace, read_block
-from .cache import cached_njit
+from .cache import cached_njit, inner_njit
 from .simd import LANES, add_dot, load, load_many, spread, spread_many, store, store_many, transpose
 from .square import (
     BLOCK_SIDE,
     BLOCKS,
     CHUNK,
-    INLINE,
-    OPTIONS,
     PIXELS,
     Rows,
     View,
@@ -27,7 +23,7 @@ from .square import (
 )
 
 
-@njit(**INLINE)
+@inner_njit(forceinline=True)
 def _read_pixels(values: Any, width: int, box: Any, block: int, scratch: Any) -> Any:
     """A block's pixels of an image of one channel; 0 outside of the box."""
     left, top = box[0] + block % BLOCK_SIDE * BLOCK_SIDE, box[1] + block // BLOCK_SIDE * BLOCK_SIDE
@@ -38,7 +34,7 @@ def _read_pixels(values: Any, width: int, box: Any, block: int, scratch: Any) ->
     return load(scratch, 0)
 
 
-@njit(**INLINE)
+@inner_njit(forceinline=True)
 def _start_backward(
     planes: Any,
     box: Any,
@@ -71,7 +67,7 @@ def _start_backward(
     store(planes, narrow.BEHIND + p, total - final * through + (1 - final) * share)
 
 
-@cached_njit(**OPTIONS)
+@cached_njit()
 def differentiate_band(
     band: int,
     view: View,

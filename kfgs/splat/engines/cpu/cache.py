@@ -19,6 +19,17 @@ _FILES = [file for folder in (_HERE, *_HERE.parents[:2]) for file in sorted(fold
 SOURCES = crc32(b"".join(file.read_bytes() for file in _FILES))
 
 
+_OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
+
+
+def inner_njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """`numba.njit` for functions that only kernels call.
+
+    Python cannot call them: what numba compiles for such a call holds one more copy of the function, and of all that it inlines.
+    """
+    return njit(no_cpython_wrapper=True, **_OPTIONS, **options)  # type: ignore[no-any-return]
+
+
 def cached_njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """`numba.njit(cache=True)` for kernels that call functions of other files.
 
@@ -29,11 +40,11 @@ def cached_njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 
     def decorate(function: Callable[..., Any]) -> Any:
         try:
-            kernel = njit(cache=True, **options)(function)
+            kernel = njit(cache=True, **_OPTIONS, **options)(function)
             index = kernel._cache._cache_file
             index.__class__, index._source_stamp = _Kept, (index._source_stamp, SOURCES)
         except (RuntimeError, AttributeError):  # no folder can be written, or another version of numba
-            return njit(**options)(function)
+            return njit(**_OPTIONS, **options)(function)
         return kernel
 
     return decorate

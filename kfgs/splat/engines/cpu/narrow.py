@@ -11,9 +11,9 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 
 from ..contract import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
+from .cache import inner_njit
 from .simd import (
     LANES,
     add_dot,
@@ -42,7 +42,6 @@ from .square import (
     CHUNK,
     FEATURES,
     FINAL,
-    INLINE,
     LIGHT,
     PIXELS,
     PREFETCH_AHEAD,
@@ -101,7 +100,7 @@ class Contest(NamedTuple):
     rounding: Any  # the most by which rounding does, see `round_off`
 
 
-@njit(**INLINE)
+@inner_njit(forceinline=True)
 def composite_square(
     rows: Rows,
     span: tuple[int, int, int],  # where the square's list begins and ends, and where its trace begins
@@ -130,7 +129,7 @@ def composite_square(
     return position
 
 
-@njit(**INLINE)
+@inner_njit(forceinline=True)
 def _composite_block(
     rows: Rows,
     square: Square,
@@ -193,7 +192,7 @@ def _composite_block(
     return any_of(going)
 
 
-@njit(**INLINE)
+@inner_njit(forceinline=True)
 def _undecided(sums: Any, p: int, light: Any, contest: Contest) -> Any:
     """Pixels of a block where another channel may still become the largest, or where the best is not positive yet."""
     planes, favour, rounding = contest
@@ -205,7 +204,7 @@ def _undecided(sums: Any, p: int, light: Any, contest: Contest) -> Any:
     return minimum(best - second - light * favour - rounding, best) <= 0
 
 
-@njit(**INLINE)
+@inner_njit(forceinline=True)
 def round_off(count: int, peak: Any, like: Any) -> Any:
     """The most by which rounding changes the difference of two sums of `count` weighted features, none larger than `peak`.
 
@@ -216,7 +215,7 @@ def round_off(count: int, peak: Any, like: Any) -> Any:
     return like.dtype.type(4 * (min(count, MOST_DRAWN) + 4) * float(kind.eps) * max(float(peak), float(kind.tiny)))
 
 
-@njit(**INLINE)
+@inner_njit(forceinline=True)
 def differentiate_square(
     rows: Rows,
     span: tuple[int, int, int],  # where the list begins, where the forward pass was done, where its trace begins
@@ -282,7 +281,7 @@ def differentiate_square(
                 store(out, place, load(out, place) + sums)
 
 
-@njit(**INLINE)
+@inner_njit(forceinline=True)
 def _sum_group(weights: Any, planes: Any, start: int, touched: Any) -> Any:
     """Weights times LANES planes, summed over the pixels of the touched blocks."""
     total = zero_many(GROUP, planes)
@@ -293,7 +292,7 @@ def _sum_group(weights: Any, planes: Any, start: int, touched: Any) -> Any:
     return sum_many(total)
 
 
-@njit(**INLINE)
+@inner_njit(forceinline=True)
 def accumulate_square(
     rows: Rows,
     span: tuple[int, int],  # where the square's list begins and ends

@@ -5,13 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
 
-from .cache import cached_njit
+from .cache import cached_njit, inner_njit
 from .project_forward import (
     BATCH,
     MEAN,
-    OPTIONS,
     OTHER,
     PLAIN,
     QUAT,
@@ -32,7 +30,7 @@ _GRAD_MEAN2D, _GRAD_CONIC, _GRAD_DEPTH = (OTHER + k * BATCH for k in (0, 2, 5))
 _STATE = OTHER + 6 * BATCH
 
 
-@cached_njit(fastmath=PLAIN, **OPTIONS)
+@cached_njit(fastmath=PLAIN)
 def differentiate_band(
     band: int,
     bands: int,
@@ -70,7 +68,7 @@ def differentiate_band(
         begin += count
 
 
-@njit(inline="always", fastmath=PLAIN, **OPTIONS)
+@inner_njit(inline="always", fastmath=PLAIN)
 def _conic_to_axes(
     u: tuple[Any, Any, Any], v: tuple[Any, Any, Any], low_pass: Any, grad: tuple[Any, Any, Any], one: Any
 ) -> tuple[Any, Any, Any, Any, Any, Any]:
@@ -97,7 +95,7 @@ def _conic_to_axes(
     )
 
 
-@njit(fastmath=PLAIN, **OPTIONS)
+@inner_njit(fastmath=PLAIN)
 def _rotation_to_quat(
     w: Any, x: Any, y: Any, z: Any, g: tuple[Any, Any, Any, Any, Any, Any, Any, Any, Any]
 ) -> tuple[Any, Any, Any, Any]:
@@ -112,7 +110,7 @@ def _rotation_to_quat(
     return g_w + g_w, g_x + g_x, g_y + g_y, g_z + g_z
 
 
-@njit(fastmath=PLAIN, **OPTIONS)
+@inner_njit(fastmath=PLAIN)
 def _differentiate_batch(state: Any, lens: Lens) -> None:
     """Replace the planes of means, quaternions and scales by the loss's slopes in them."""
     one, none, floor = state.dtype.type(1), state.dtype.type(0), state.dtype.type(QUAT_FLOOR)
@@ -160,7 +158,7 @@ def _differentiate_batch(state: Any, lens: Lens) -> None:
         state[SCALE + i], state[SCALE + BATCH + i], state[SCALE + 2 * BATCH + i] = g_sx, g_sy, g_sz
 
 
-@njit(fastmath=PLAIN, **OPTIONS)
+@inner_njit(fastmath=PLAIN)
 def _jacobian_to_point(
     lens: Lens,
     point: tuple[Any, Any, Any],

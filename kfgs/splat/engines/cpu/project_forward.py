@@ -13,11 +13,10 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 
 from ...project import FIELD_OF_VIEW_MARGIN
 from ..contract import Pinhole
-from .cache import cached_njit
+from .cache import cached_njit, inner_njit
 
 BATCH = 64
 MEAN, QUAT, SCALE = 0, 3 * BATCH, 7 * BATCH
@@ -32,7 +31,6 @@ _REACH, _MEAN2D, _CONIC, _EXTENT, _KEPT = (OTHER + k * BATCH for k in (0, 1, 3, 
 _STATE = OTHER + 9 * BATCH
 
 PLAIN = {"contract", "nsz", "arcp"}  # NaN and infinity keep their meaning: they are what culls broken Gaussians
-OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
 
 
 class Lens(NamedTuple):
@@ -68,7 +66,7 @@ def make_lens(pinhole: Pinhole) -> Lens:
     return Lens(turn, shift, focal, principal, least, most, size, *options)  # type: ignore[arg-type]
 
 
-@njit(fastmath=PLAIN, **OPTIONS)
+@inner_njit(fastmath=PLAIN)
 def gather(state: Any, slot: int, row: int, means: Any, quats: Any, scales: Any) -> None:
     """Copy one Gaussian into place `slot` of the planes; the arrays are flat."""
     slot, row = max(slot, 0), max(row, 0)
@@ -79,7 +77,7 @@ def gather(state: Any, slot: int, row: int, means: Any, quats: Any, scales: Any)
         state[QUAT + k * BATCH + slot] = quats[4 * row + k]
 
 
-@njit(fastmath=PLAIN, **OPTIONS)
+@inner_njit(fastmath=PLAIN)
 def to_camera(state: Any, i: int, lens: Lens) -> tuple[Any, Any, Any]:
     """R X + t of the batch's Gaussian i."""
     r, t = lens.turn, lens.shift
@@ -90,7 +88,7 @@ def to_camera(state: Any, i: int, lens: Lens) -> tuple[Any, Any, Any]:
     return x, y, z
 
 
-@njit(fastmath=PLAIN, **OPTIONS)
+@inner_njit(fastmath=PLAIN)
 def normalize(state: Any, i: int) -> tuple[Any, Any, Any, Any, Any]:
     """Quaternion (w, x, y, z) of the batch's Gaussian i divided by its norm, and the norm."""
     w, x = state[QUAT + i], state[QUAT + BATCH + i]
@@ -100,7 +98,7 @@ def normalize(state: Any, i: int) -> tuple[Any, Any, Any, Any, Any]:
     return w * scale, x * scale, y * scale, z * scale, norm
 
 
-@njit(fastmath=PLAIN, **OPTIONS)
+@inner_njit(fastmath=PLAIN)
 def rotation(w: Any, x: Any, y: Any, z: Any, one: Any) -> tuple[Any, Any, Any, Any, Any, Any, Any, Any, Any]:
     """Row-major rotation matrix of a quaternion."""
     x2, y2, z2 = x + x, y + y, z + z
@@ -117,7 +115,7 @@ def rotation(w: Any, x: Any, y: Any, z: Any, one: Any) -> tuple[Any, Any, Any, A
     )
 
 
-@njit(fastmath=PLAIN, **OPTIONS)
+@inner_njit(fastmath=PLAIN)
 def linearize(lens: Lens, tan_x: Any, tan_y: Any, per_z: Any) -> tuple[Any, Any, Any, Any, Any, Any]:
     """Rows x and y of J W, [2, 3]: J's entries are focal / z, and minus that times the tangent within its limits."""
     r = lens.turn
@@ -134,26 +132,26 @@ def linearize(lens: Lens, tan_x: Any, tan_y: Any, per_z: Any) -> tuple[Any, Any,
     )
 
 
-@njit(fastmath=PLAIN, **OPTIONS)
+@inner_njit(fastmath=PLAIN)
 def turn_row(row: tuple[Any, Any, Any], R: tuple[Any, ...]) -> tuple[Any, Any, Any]:
     """Row R."""
     a, b, c = row
     return (a * R[0] + b * R[3] + c * R[6], a * R[1] + b * R[4] + c * R[7], a * R[2] + b * R[5] + c * R[8])
 
 
-@njit(fastmath=PLAIN, **OPTIONS)
+@inner_njit(fastmath=PLAIN)
 def dot(u: tuple[Any, Any, Any], v: tuple[Any, Any, Any]) -> Any:
     """U . v."""
     return u[0] * v[0] + u[1] * v[1] + u[2] * v[2]
 
 
-@njit(fastmath=PLAIN, **OPTIONS)
+@inner_njit(fastmath=PLAIN)
 def cross(u: tuple[Any, Any, Any], v: tuple[Any, Any, Any]) -> tuple[Any, Any, Any]:
     """U x v."""
     return u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]
 
 
-@cached_njit(fastmath=PLAIN, **OPTIONS)
+@cached_njit(fastmath=PLAIN)
 def project_band(
     band: int,
     bands: int,
@@ -167,18 +165,18 @@ def project_band(
     means, first, last = gaussians[0], len(reach) * band // bands, len(reach) * (band + 1) // bands
     state, depths = np.zeros(_STATE, means.dtype), np.empty(BATCH, means.dtype)
     waiting = np.empty(2 * BATCH, np.int64)
-    count, end = 0, first
+    count, end, most = np.int64(0), first, np.int64(BATCH)  # numba compiles again for each plain number
     for begin in range(first, last, BATCH):
         count = _append_candidates(waiting, count, begin, min(begin + BATCH, last), lens, means, reach, depths)
         if count >= BATCH:
-            end = _project_waiting(waiting, BATCH, lens, gaussians, reach, state, out, end)
+            end = _project_waiting(waiting, most, lens, gaussians, reach, state, out, end)
             count -= BATCH
             for k in range(count):
                 waiting[k] = waiting[BATCH + k]
     counts[band] = _project_waiting(waiting, count, lens, gaussians, reach, state, out, end) - first
 
 
-@njit(fastmath=PLAIN, **OPTIONS)
+@inner_njit(fastmath=PLAIN)
 def _append_candidates(
     waiting: Any, count: int, begin: int, end: int, lens: Lens, means: Any, reach: Any, depths: Any
 ) -> int:
@@ -194,7 +192,7 @@ def _append_candidates(
     return count
 
 
-@njit(fastmath=PLAIN, **OPTIONS)
+@inner_njit(fastmath=PLAIN)
 def _project_waiting(
     waiting: Any, count: int, lens: Lens, gaussians: Any, reach: Any, state: Any, out: Any, end: int
 ) -> int:
@@ -220,7 +218,7 @@ def _project_waiting(
     return end
 
 
-@njit(fastmath=PLAIN, **OPTIONS)
+@inner_njit(fastmath=PLAIN)
 def _project_batch(state: Any, lens: Lens) -> None:
     """Fill the planes that follow _REACH; the third of the means becomes the depths."""
     one, none = state.dtype.type(1), state.dtype.type(0)
@@ -260,7 +258,7 @@ def _project_batch(state: Any, lens: Lens) -> None:
         state[MEAN + 2 * BATCH + i] = z
 
 
-@njit(fastmath=PLAIN, **OPTIONS)
+@inner_njit(fastmath=PLAIN)
 def _covers_center(mean: Any, extent: Any, size: Any, half: Any, rounding: Any) -> bool:
     """Whether a pixel of 0 to size - 1 has its centre within `extent` of `mean`, as `pixel_box` has it."""
     slack = rounding * (abs(mean) + extent)

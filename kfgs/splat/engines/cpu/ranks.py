@@ -16,20 +16,17 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
 
 from . import narrow as narrow
 from . import wide as wide
 from .bands import SIXTEEN
-from .cache import cached_njit
+from .cache import cached_njit, inner_njit
 from .simd import LANES, fetch, load, load_many, put, select, spread, store, store_many, transpose
 from .square import (
     BLOCK_SIDE,
     BLOCKS,
     CHUNK,
     FINAL,
-    INLINE,
-    OPTIONS,
     PIXELS,
     Rows,
     View,
@@ -40,7 +37,7 @@ from .square import (
 )
 
 
-@njit(**INLINE)
+@inner_njit(forceinline=True)
 def _rank_block(
     planes: Any,  # channel c of the pixels is the vector at place + c * stride
     place: int,
@@ -67,7 +64,7 @@ def _rank_block(
         last, chosen = best, which
 
 
-@njit(**INLINE)
+@inner_njit(forceinline=True)
 def _write_ranks(ranked: Any, final: Any, box: Any, block: int, images: Any, width: int) -> None:
     """Labels, scores and alphas of a block's pixels, as far as they lie in the box."""
     names, values = ranked
@@ -83,7 +80,7 @@ def _write_ranks(ranked: Any, final: Any, box: Any, block: int, images: Any, wid
                 put(scores, pixel * top + rank, values[rank * LANES + lane])
 
 
-@cached_njit(**OPTIONS)
+@cached_njit()
 def find_candidates(band: int, bands: int, features: Any, channels: int, index: Any, masks: Any, favours: Any) -> None:
     """The channels of which a Gaussian gives at least a fair share, as bits; all channels if it gives less than nothing.
 
@@ -118,7 +115,7 @@ def find_candidates(band: int, bands: int, features: Any, channels: int, index: 
         masks[m] = mask if least >= 0 and total < np.inf else ~np.uint64(0)
 
 
-@njit(**INLINE)
+@inner_njit(forceinline=True)
 def _gather_columns(
     contest: Any, order: Any, start: int, end: int, channels: int, columns: Any
 ) -> tuple[int, float, float]:
@@ -136,7 +133,7 @@ def _gather_columns(
     return count, favour, peak
 
 
-@cached_njit(**OPTIONS)
+@cached_njit()
 def rank_band(
     band: int,
     view: View,

@@ -9,19 +9,18 @@ from typing import Any
 
 import numpy as np
 import torch
-from numba import njit
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from ...sh import C1, C2, C3, SH_C0, fill_harmonics
-from .cache import cached_njit
+from .cache import cached_njit, inner_njit
 from .memory import flat, take_memory
-from .project_forward import OPTIONS, PLAIN
+from .project_forward import PLAIN
 from .threads import run_bands
 
 _SHARE = 8192  # Gaussians of a band
 _SHORTEST = 1e-12  # a direction is divided by its length or by this, as torch's `normalize` does
-_fill_harmonics = njit(fastmath=PLAIN, **OPTIONS)(fill_harmonics)
+_fill_harmonics = inner_njit(fastmath=PLAIN)(fill_harmonics)
 
 
 def shade(sh: Tensor, means: Tensor, center: Tensor, index: Tensor) -> Tensor:
@@ -52,7 +51,7 @@ def _run(kernel: Any, index: Tensor, K: int, *tensors: Tensor) -> None:
     run_bands(kernel, bands, bands, int(K), *(flat(tensor) for tensor in tensors))
 
 
-@cached_njit(fastmath=PLAIN, **OPTIONS)
+@cached_njit(fastmath=PLAIN)
 def _shade_band(band: int, bands: int, K: int, sh: Any, means: Any, center: Any, index: Any, out: Any) -> None:
     count = len(index)
     basis = np.full(16, SH_C0, sh.dtype)
@@ -64,7 +63,7 @@ def _shade_band(band: int, bands: int, K: int, sh: Any, means: Any, center: Any,
             out[3 * m + c] = max(_color(basis, sh, row, K, c), basis.dtype.type(0))
 
 
-@cached_njit(fastmath=PLAIN, **OPTIONS)
+@cached_njit(fastmath=PLAIN)
 def _differentiate_band(
     band: int, bands: int, K: int, grads: Any, sh: Any, means: Any, center: Any, index: Any, out_sh: Any, out_means: Any
 ) -> None:
@@ -92,7 +91,7 @@ def _differentiate_band(
         out_means[3 * row + 2] = scale * (slopes[2] - along * z)
 
 
-@njit(fastmath=PLAIN, **OPTIONS)
+@inner_njit(fastmath=PLAIN)
 def _direction(means: Any, center: Any, row: int) -> tuple[Any, Any, Any, Any]:
     """The unit vector from the camera to the Gaussian, and 1 / the distance."""
     x, y, z = means[3 * row] - center[0], means[3 * row + 1] - center[1], means[3 * row + 2] - center[2]
@@ -101,7 +100,7 @@ def _direction(means: Any, center: Any, row: int) -> tuple[Any, Any, Any, Any]:
     return x * scale, y * scale, z * scale, scale
 
 
-@njit(fastmath=PLAIN, **OPTIONS)
+@inner_njit(fastmath=PLAIN)
 def _color(basis: Any, sh: Any, row: int, K: int, c: int) -> Any:
     """One channel before it is clamped."""
     total = basis.dtype.type(0)
@@ -110,7 +109,7 @@ def _color(basis: Any, sh: Any, row: int, K: int, c: int) -> Any:
     return total + basis.dtype.type(0.5)
 
 
-@njit(fastmath=PLAIN, **OPTIONS)
+@inner_njit(fastmath=PLAIN)
 def _turn(slopes: Any, g: Any, K: int, x: Any, y: Any, z: Any) -> None:
     """The slopes of sum_k g_k Y_k in x, y and z."""
     dx, dy, dz = -C1 * g[3], -C1 * g[1], C1 * g[2]

@@ -25,10 +25,12 @@ from typing import Any
 
 import numpy as np
 from llvmlite import ir
-from numba import njit, types
+from numba import types
 from numba.core import cgutils
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
 from numba.extending import intrinsic, lower_builtin, models, register_model
+
+from .cache import inner_njit
 
 LANES = 16
 """Numbers per vector: a block of 4 x 4 pixels, and one AVX-512 register of float32."""
@@ -377,7 +379,7 @@ def bits(context: Any, builder: Any, kinds: Any, mask: Any) -> Any:
     return builder.zext(builder.bitcast(mask, ir.IntType(LANES)), _I32)
 
 
-@njit(forceinline=True)
+@inner_njit(forceinline=True)
 def any_of(mask: Any) -> bool:
     """Whether some lane of the mask holds."""
     return bits(mask) != 0  # type: ignore[no-any-return]

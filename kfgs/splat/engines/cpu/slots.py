@@ -8,14 +8,13 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
 
-from .cache import cached_njit
+from .cache import cached_njit, inner_njit
 from .simd import LANES, fetch, lanes_below, load, load_part, prefetch, put, store, store_part
-from .square import INLINE, OPTIONS, PREFETCH_AHEAD, View, aligned
+from .square import PREFETCH_AHEAD, View, aligned
 
 
-@cached_njit(**OPTIONS)
+@cached_njit()
 def number_slots(
     band: int,
     view: View,
@@ -37,7 +36,7 @@ def number_slots(
     counts[band] = count
 
 
-@cached_njit(**OPTIONS)
+@cached_njit()
 def chain_slots(view: View, owners: Any, counts: Any, heads: Any, following: Any) -> None:
     """Link the rows of each Gaussian over all bands: heads [M] and following [R], in order of the bands, -1 at the end."""
     heads[:] = -1
@@ -51,7 +50,7 @@ def chain_slots(view: View, owners: Any, counts: Any, heads: Any, following: Any
             heads[owner] = row
 
 
-@njit(**INLINE)
+@inner_njit(forceinline=True)
 def _sum_chain(row: int, following: Any, out: Any, width: int, total: Any) -> None:
     """Total = sum of the rows of one Gaussian; zeros if it has none."""
     for i in range(0, width, LANES):
@@ -62,7 +61,7 @@ def _sum_chain(row: int, following: Any, out: Any, width: int, total: Any) -> No
         row = following[row]
 
 
-@cached_njit(**OPTIONS)
+@cached_njit()
 def gather_gradients(
     band: int,
     bands: int,  # one if two Gaussians may show the same row of features
@@ -103,7 +102,7 @@ def gather_gradients(
             store_part(of_features, into + i, lanes, load_part(of_features, into + i, lanes) + value)
 
 
-@cached_njit(**OPTIONS)
+@cached_njit()
 def gather_sums(band: int, bands: int, chains: Any, out: Any, width: int, sums: Any, weights: Any) -> None:
     """Sum all rows of each Gaussian of one share: sums [M, D] and weights [M], written."""
     heads, following = chains

@@ -15,10 +15,9 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 
 from ..contract import ALPHA_MAX, ALPHA_MIN
-from .cache import cached_njit
+from .cache import cached_njit, inner_njit
 from .simd import (
     LANES,
     bits,
@@ -62,9 +61,6 @@ X, Y, LIGHT, FINAL = 0, PIXELS, 2 * PIXELS, 3 * PIXELS
 transmittance with which the pixel stopped."""
 STATE = 4 * PIXELS
 
-OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
-INLINE: dict[str, Any] = OPTIONS | {"forceinline": True}
-
 _LISTED, _WORDS = 32, 8
 """Gaussians whose bits are listed together, and the 64-bit words that hold these."""
 _SIXTEEN_BITS = np.uint64(0xFFFF)
@@ -76,7 +72,7 @@ LOG2_ALPHA_MIN = math.log2(ALPHA_MIN)
 _LOG2_E = math.log2(math.e)
 
 
-@njit(**INLINE)
+@inner_njit(forceinline=True)
 def aligned(count: int, like: Any) -> Any:
     """Memory for `count` numbers of the array's type that begins on a cache line; a vector in two cache lines costs double."""
     size = like.itemsize
@@ -85,13 +81,13 @@ def aligned(count: int, like: Any) -> Any:
     return room[skip : skip + count]
 
 
-@njit(**INLINE)
+@inner_njit(forceinline=True)
 def row_length(channels: int) -> int:
     """Numbers in a packed row: whole vectors, so that rows stay aligned."""
     return (FEATURES + channels + LANES - 1) // LANES * LANES
 
 
-@cached_njit(**OPTIONS)
+@cached_njit()
 def pack_rows(
     band: int,
     bands: int,
@@ -165,7 +161,7 @@ class Place(NamedTuple):
     trace: int  # where its part of the trace begins
 
 
-@njit(**OPTIONS)
+@inner_njit()
 def squares_of(view: View, band: int) -> Iterator[Place]:
     """The squares of a band's tiles, front to back."""
     columns = (view.width + view.tile_size - 1) // view.tile_size
@@ -181,14 +177,14 @@ def squares_of(view: View, band: int) -> Iterator[Place]:
                 yield Place(tile * view.across**2 + square, (left, top, right, bottom), start, end, trace)
 
 
-@njit(**INLINE)
+@inner_njit(forceinline=True)
 def make_square(like: Any) -> Square:
     """Memory for squares of the array's type."""
     hits, counts = np.empty(BLOCKS * CHUNK, np.int32), np.empty(BLOCKS, np.int32)
     return Square(aligned(STATE, like), aligned(2 * BLOCKS, like), hits, counts)
 
 
-@njit(**INLINE)
+@inner_njit(forceinline=True)
 def start_square(square: Square, box: tuple[int, int, int, int]) -> Any:
     """Place the pixel centres, with no light outside of the box; returns the bits of the blocks without any pixel."""
     state, corners = square.state, square.corners
@@ -207,7 +203,7 @@ def start_square(square: Square, box: tuple[int, int, int, int]) -> Any:
     return dark
 
 
-@njit(**INLINE)
+@inner_njit(forceinline=True)
 def touched_blocks(rows: Any, at: int, corners: Any, epsilon: Any) -> Any:
     """Bits of the blocks where alpha may reach ALPHA_MIN, of the packed Gaussian at rows[at:].
 
@@ -234,7 +230,7 @@ def touched_blocks(rows: Any, at: int, corners: Any, epsilon: Any) -> Any:
     return bits(minimum(on_x, on_y) <= slack + limit)
 
 
-@njit(**INLINE)
+@inner_njit(forceinline=True)
 def weigh_pixels(rows: Any, at: int, x: Any, y: Any) -> tuple[Any, Any, Any, Any]:
     """Offsets from the mean, opacity * density, and alpha (0 where skipped) of one Gaussian at a block's pixels."""
     dx, dy = x - fetch(rows, at + MEAN_X), y - fetch(rows, at + MEAN_Y)
@@ -244,7 +240,7 @@ def weigh_pixels(rows: Any, at: int, x: Any, y: Any) -> tuple[Any, Any, Any, Any
     return dx, dy, full, select(power >= LOG2_ALPHA_MIN, minimum(full, ALPHA_MAX), 0)
 
 
-@njit(**INLINE)
+@inner_njit(forceinline=True)
 def list_hits(rows: Rows, span: tuple[int, int], dark: Any, square: Square, trace: Any, into: int) -> None:
     """List, for each block of a square, the places in span that touch it, without the blocks whose bits are in `dark`.
 
@@ -255,7 +251,7 @@ def list_hits(rows: Rows, span: tuple[int, int], dark: Any, square: Square, trac
     epsilon = values.dtype.type(np.finfo(values.dtype).eps)
     hits, counts = square.hits, square.counts
     counts[:] = 0
-    words = np.zeros(_WORDS, np.uint64)
+    words = np.empty(_WORDS, np.uint64)
     for begin in range(first, stop, _LISTED):
         words[:] = 0
         for j in range(begin, min(begin + _LISTED, stop)):
@@ -278,7 +274,7 @@ def list_hits(rows: Rows, span: tuple[int, int], dark: Any, square: Square, trac
             put(counts, block, number)
 
 
-@njit(**INLINE)
+@inner_njit(forceinline=True)
 def _transpose_bits(words: Any) -> None:
     """Turn the blocks of each of 16 Gaussians into the Gaussians of each of 16 blocks: first for 16 of them, then for 16 more.
 
@@ -295,7 +291,7 @@ def _transpose_bits(words: Any) -> None:
         words[half + 2], words[half + 3] = _transpose_word(c), _transpose_word(d)
 
 
-@njit(**INLINE)
+@inner_njit(forceinline=True)
 def _transpose_word(word: Any) -> Any:
     """The last two steps, within four rows."""
     t = ((word >> _2) ^ (word >> _32)) & _PAIRS

@@ -12,10 +12,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from numba import njit
 from torch import Tensor
 
-from .cache import cached_njit
+from .cache import cached_njit, inner_njit
 from .memory import flat, take_memory
 from .simd import (
     LANES,
@@ -34,7 +33,7 @@ from .simd import (
     sum_lanes,
     zero_many,
 )
-from .square import INLINE, OPTIONS, aligned
+from .square import aligned
 from .threads import run_bands
 
 WINDOW = 11
@@ -74,7 +73,7 @@ def mean_ssim(
     return picture.new_tensor(sums.sum() / count), out
 
 
-@njit(**INLINE)
+@inner_njit(forceinline=True)
 def _along(values: Any, j: int, step: int, window: Any) -> Any:
     """The window's weighted sums, of numbers `step` apart, that begin at LANES places from j on."""
     total = load(values, j + 5 * step) * window[5]
@@ -83,7 +82,7 @@ def _along(values: Any, j: int, step: int, window: Any) -> Any:
     return total
 
 
-@cached_njit(**OPTIONS)
+@cached_njit()
 def compare_band(
     band: int,
     bands: int,
@@ -135,7 +134,7 @@ def compare_band(
     sums[band] = total
 
 
-@cached_njit(**OPTIONS)
+@cached_njit()
 def spread_band(
     band: int,
     bands: int,

@@ -10,9 +10,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
 
-from .cache import cached_njit
+from .cache import cached_njit, inner_njit
 
 BATCH = 64
 _X, _Y, _A, _B, _C, _EXTENT_X, _EXTENT_Y, _REACH = (k * BATCH for k in range(8))
@@ -20,10 +19,10 @@ _LEFT, _RIGHT, _TOP, _BOTTOM, _HIT = (k * BATCH for k in range(8, 13))  # the bo
 _TILE_X, _TILE_Y, _TOUCHED = (k * BATCH for k in range(16, 19))  # tiles of one Gaussian
 _STATE = 19 * BATCH
 
-_OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}  # no fused multiply-add: torch rounds each product
+# No kernel here has fused multiply-adds: torch rounds each product.
 
 
-@cached_njit(**_OPTIONS)
+@cached_njit()
 def find_pairs(
     band: int,
     bands: int,
@@ -37,7 +36,7 @@ def find_pairs(
     width, height, side = picture
     columns = (width + side - 1) // side
     tiles = columns * ((height + side - 1) // side)
-    state, end = np.zeros(_STATE, splats[0].dtype), 0
+    state, end = np.zeros(_STATE, splats[0].dtype), np.int64(0)  # a plain 0 is a type of its own to numba
     first, last = len(order) * band // bands, len(order) * (band + 1) // bands
     pairs = np.empty((2, 4 * (last - first) + 4 * BATCH), np.int32)
     for begin in range(first, last, BATCH):
@@ -51,15 +50,18 @@ def find_pairs(
     return pairs[0, :end], pairs[1, :end]
 
 
-@cached_njit(**_OPTIONS)
+@cached_njit()
 def sort_keys(keys: Any) -> Any:  # [M] uint32, overwritten -> [M] int32
     """Rows in the order of their keys; equal keys by row. Each pass orders them by 11 bits more."""
-    rows, sorted_keys, sorted_rows = np.arange(len(keys), dtype=np.int32), keys.copy(), np.empty(len(keys), np.int32)
+    rows, sorted_keys, sorted_rows = np.empty(len(keys), np.int32), np.empty_like(keys), np.empty(len(keys), np.int32)
+    for i in range(len(keys)):
+        rows[i] = i
     for shift in range(0, 33, 11):
         places = np.zeros(2049, np.int32)
         for key in keys:
             places[(key >> shift & 2047) + 1] += 1
-        places = np.cumsum(places)
+        for digit in range(2048):
+            places[digit + 1] += places[digit]
         for i in range(len(keys)):
             digit = keys[i] >> shift & 2047
             place = places[digit]
@@ -69,7 +71,7 @@ def sort_keys(keys: Any) -> Any:  # [M] uint32, overwritten -> [M] int32
     return rows
 
 
-@cached_njit(**_OPTIONS)
+@cached_njit()
 def list_rows(
     tiles: Any,  # of the pairs, from `find_pairs`
     which: Any,  # the pairs' rows
@@ -84,14 +86,14 @@ def list_rows(
         starts[tile] = at + 1
 
 
-@njit(**_OPTIONS)
+@inner_njit()
 def _count_tiles(tiles: Any, end: int, counts: Any) -> None:
     """Count the pairs of each tile. A function of its own: numba counts references to arrays that a loop exchanges."""
     for p in range(end):
         counts[max(tiles[p], 0)] += 1
 
 
-@njit(**_OPTIONS)
+@inner_njit()
 def _count_boxes(state: Any, count: int) -> int:
     """How many pairs `_append_batch` may look at."""
     total = 0
@@ -100,15 +102,16 @@ def _count_boxes(state: Any, count: int) -> int:
     return total
 
 
-@njit(**_OPTIONS)
+@inner_njit()
 def _grow(pairs: Any, count: int, room: int) -> Any:
     """A longer copy."""
     longer = np.empty((2, 2 * pairs.shape[1] + room), pairs.dtype)
-    longer[:, :count] = pairs[:, :count]
+    for k in range(count):
+        longer[0, k], longer[1, k] = pairs[0, k], pairs[1, k]
     return longer
 
 
-@njit(**_OPTIONS)
+@inner_njit()
 def _gather(state: Any, order: Any, begin: int, count: int, splats: tuple[Any, Any, Any, Any]) -> None:
     """Copy some Gaussians, front to back, into the planes."""
     means2d, conics, extents, reaches = splats
@@ -120,7 +123,7 @@ def _gather(state: Any, order: Any, begin: int, count: int, splats: tuple[Any, A
         state[_REACH + k] = reaches[row]
 
 
-@njit(**_OPTIONS)
+@inner_njit()
 def _test_batch(state: Any, width: int, height: int, side: int, eps: float) -> None:
     """Find each Gaussian's box of tiles, and test the first 2 x 2 of them."""
     kind = state.dtype.type
@@ -144,7 +147,7 @@ def _test_batch(state: Any, width: int, height: int, side: int, eps: float) -> N
         state[_HIT + 3 * BATCH + i] = one if wide & high & _touches(form, x_1, y_1, length) else one - one
 
 
-@njit(inline="always", **_OPTIONS)
+@inner_njit(inline="always")
 def _span(mean: Any, extent: Any, pixels: Any, half: Any, one: Any, per_side: Any, rounding: Any) -> tuple[Any, Any]:
     """First and one past the last tile, along one axis, with a pixel centre within `extent` of the mean (`pixel_box`)."""
     slack = rounding * (abs(mean) + extent)
@@ -157,7 +160,7 @@ def _span(mean: Any, extent: Any, pixels: Any, half: Any, one: Any, per_side: An
     return begin if filled else one - one, end if filled else one - one
 
 
-@njit(inline="always", **_OPTIONS)
+@inner_njit(inline="always")
 def _touches(form: tuple[Any, Any, Any, Any, Any, Any, Any, Any], left: Any, top: Any, length: Any) -> bool:
     """Whether the form's least value over a square of pixel centres is within its limit; NaN is not.
 
@@ -179,7 +182,7 @@ def _touches(form: tuple[Any, Any, Any, Any, Any, Any, Any, Any], left: Any, top
     return known & (min(on_x, on_y) <= reach + slack * (terms + abs(reach) + one))
 
 
-@njit(**_OPTIONS)
+@inner_njit()
 def _append_batch(
     state: Any, order: Any, begin: int, count: int, side: int, columns: int, eps: float, tiles: Any, rows: Any, end: int
 ) -> int:
@@ -199,7 +202,7 @@ def _append_batch(
     return end
 
 
-@njit(**_OPTIONS)
+@inner_njit()
 def _test_box(
     state: Any, k: int, box: tuple[int, int, int, int], side: int, columns: int, eps: float, tiles: Any, end: int
 ) -> int:
@@ -209,18 +212,18 @@ def _test_box(
     x, y, a, b, c = state[_X + k], state[_Y + k], state[_A + k], state[_B + k], state[_C + k]
     form = a, b + b, c, -b / a, -b / c, state[_REACH + k], slack, one
     left, right, top, bottom = box
-    count = 0
+    count: Any = np.int64(0)
     for tile_y in range(top, bottom):
         for tile_x in range(left, right):
             state[_TILE_X + max(count, 0)], state[_TILE_Y + max(count, 0)] = tile_x, tile_y
             count += 1
             if count == BATCH:
                 end = _append_touched(state, count, form, x, y, columns, length, tiles, end)
-                count = 0
+                count = np.int64(0)
     return _append_touched(state, count, form, x, y, columns, length, tiles, end)
 
 
-@njit(**_OPTIONS)
+@inner_njit()
 def _append_touched(
     state: Any, count: int, form: Any, x: Any, y: Any, columns: int, length: Any, tiles: Any, end: int
 ) -> int:

@@ -10,9 +10,9 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 
 from ..contract import ALPHA_MAX, TRANSMITTANCE_MIN
+from .cache import inner_njit
 from .simd import (
     LANES,
     add_dot,
@@ -40,7 +40,6 @@ from .square import (
     BLOCKS,
     CHUNK,
     FINAL,
-    INLINE,
     LIGHT,
     PIXELS,
     Rows,
@@ -55,7 +54,7 @@ from .square import (
 FOUR, SIXTEEN = (0,) * 4, (0,) * 16
 
 
-@njit(**INLINE)
+@inner_njit(forceinline=True)
 def padded_length(channels: int) -> int:
     """Numbers in a row of whole vectors."""
     return -(-channels // LANES) * LANES
@@ -78,7 +77,7 @@ class Kept(NamedTuple):
     begins: Any  # [CHUNK] in the features
 
 
-@njit(**INLINE)
+@inner_njit(forceinline=True)
 def make_kept(like: Any) -> Kept:
     """Memory of the array's type."""
     numbers = aligned(2 * (CHUNK + 3) * LANES, like)
@@ -86,7 +85,7 @@ def make_kept(like: Any) -> Kept:
     return Kept(numbers[:half], numbers[half:], np.empty(CHUNK, np.int64), np.empty(CHUNK, np.int64))
 
 
-@njit(**INLINE)
+@inner_njit(forceinline=True)
 def weigh_block(rows: Rows, block: int, square: Square, begins: Any, kept: Kept) -> tuple[int, bool]:
     """Composite the listed Gaussians into a block's transmittance, keeping those that are drawn.
 
@@ -118,7 +117,7 @@ def weigh_block(rows: Rows, block: int, square: Square, begins: Any, kept: Kept)
     return drawn_count, any_of(light >= TRANSMITTANCE_MIN)
 
 
-@njit(**INLINE)
+@inner_njit(forceinline=True)
 def add_colors(
     sums: Any,  # rows of `stride` numbers, one per pixel; the block's begin at `into`
     into: int,
@@ -138,7 +137,7 @@ def add_colors(
         store_many(sums, at, stride, total)
 
 
-@njit(**INLINE)
+@inner_njit(forceinline=True)
 def composite_square(
     rows: Rows,
     span: tuple[int, int, int],  # where the square's list begins and ends, and where its trace begins
@@ -168,7 +167,7 @@ def composite_square(
     return position, filled
 
 
-@njit(**INLINE)
+@inner_njit(forceinline=True)
 def differentiate_square(
     rows: Rows,
     span: tuple[int, int, int],  # where the list begins, where the forward pass was done, where its trace begins
@@ -208,7 +207,7 @@ def differentiate_square(
             add_features(out, LANES + stride, slots, kept, grads, corner, stride, count)
 
 
-@njit(**INLINE)
+@inner_njit(forceinline=True)
 def multiply_features(
     slopes: Any, source: Source, begins: Any, grads: Any, corner: int, stride: int, count: int
 ) -> None:
@@ -229,7 +228,7 @@ def multiply_features(
         store_many(slopes, k * LANES, LANES, regroup((a, b, c, d)))
 
 
-@njit(**INLINE)
+@inner_njit(forceinline=True)
 def _multiply_quad(features: Any, four: Any, grads: Any, row: int, stride: int, channels: int) -> Any:
     """Products of four Gaussians (quarters of the vector) with four pixels (places in a quarter)."""
     f0, f1, f2, f3 = four
@@ -250,7 +249,7 @@ def _multiply_quad(features: Any, four: Any, grads: Any, row: int, stride: int, 
     return sum_many(total)
 
 
-@njit(**INLINE)
+@inner_njit(forceinline=True)
 def add_moments(
     rows: Rows,
     block: int,
@@ -284,7 +283,7 @@ def add_moments(
     store(planes, p, behind)
 
 
-@njit(**INLINE)
+@inner_njit(forceinline=True)
 def add_features(
     out: Any, width: int, slots: Any, kept: Kept, grads: Any, corner: int, stride: int, count: int
 ) -> None:
