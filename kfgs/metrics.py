@@ -104,7 +104,8 @@ class ConfusionMatrix:
             TypeError: if labels are not integers.
             ValueError: if shapes differ, or a label lies outside [0, classes) and is neither -1 nor ignored.
         """
-        pred, target = _alike("pred", pred, target)
+        pred, target = as_tensor("pred", pred), as_tensor("target", target)
+        check_shapes(("target", target, tuple(pred.shape)))
         for name, labels in (("pred", pred), ("target", target)):
             if labels.is_floating_point() or labels.is_complex() or labels.dtype == torch.bool:
                 raise TypeError(f"{name}: expected integer labels, got {labels.dtype}; convert with .long()")
@@ -159,7 +160,8 @@ def psnr(
         >>> psnr(torch.zeros(4, 4, 3), torch.full((4, 4, 3), 0.1))
         tensor(20.)
     """
-    image, target = _alike("image", image, target)
+    image, target = as_tensor("image", image), as_tensor("target", target)
+    check_shapes(("target", target, tuple(image.shape)))
     check_range("peak", peak, 0, closed=(False, False))
     return kornia.metrics.psnr(image, target, peak)
 
@@ -204,13 +206,3 @@ def semantic_storage_bytes(gaussians: int, channels: int, decoder_parameters: in
         92
     """
     return 4 * (gaussians * (_ATTRIBUTES + channels) + decoder_parameters + codebook_values)
-
-
-def _alike(name: str, value: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
-    """Two tensors (or arrays) of one shape."""
-    value, target = as_tensor(name, value), as_tensor("target", target)
-    if value.shape != target.shape:
-        raise ValueError(
-            f"target: expected the shape of {name}, {tuple(value.shape)}, got {tuple(target.shape)}; resize one of them"
-        )
-    return value, target

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from .._arrays import reading
 from .._files import as_path, file_stem, read_json, write_json
 from ..fields.examples import Mask
 from ..labels.classify import decode_rle
@@ -115,7 +116,8 @@ def save_coco(
 def read_coco(path: Path) -> tuple[dict[int, str], dict[str, CocoPicture]]:
     """The categories by id, and the pictures by stem; a ValueError if it is not COCO's JSON, or repeats a name."""
     top = read_json(path)
-    try:
+    expected = "COCO's 'categories', 'images' and 'annotations', each annotation with the id of an image"
+    with reading(path, expected, "export it again"):
         names = {int(entry["id"]): str(entry["name"]) for entry in top["categories"]}
         pictures = {
             int(entry["id"]): CocoPicture((int(entry["height"]), int(entry["width"])), []) for entry in top["images"]
@@ -123,11 +125,6 @@ def read_coco(path: Path) -> tuple[dict[int, str], dict[str, CocoPicture]]:
         stems = {int(entry["id"]): file_stem(str(entry["file_name"])) for entry in top["images"]}
         for annotation in top["annotations"]:
             pictures[int(annotation["image_id"])].annotations.append(annotation)
-    except (TypeError, KeyError, ValueError, OverflowError) as error:
-        raise ValueError(
-            f"{path}: expected COCO's 'categories', 'images' and 'annotations', each annotation with the id of an image; got "
-            f"something else ({type(error).__name__}: {error}); export it again"
-        ) from error
     if len(set(stems.values())) != len(stems) or len(set(names.values())) != len(names) or not names or not pictures:
         raise ValueError(f"{path}: expected some images and categories, each name once; export it again")
     for number, picture in pictures.items():

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from .._arrays import read_arrays
+from .._arrays import read_arrays, reading
 from .._files import as_path, read_json
 from ..scenes.files import list_images
 from ..scenes.load import is_scene
@@ -80,8 +80,6 @@ def _read_surface(folder: Path) -> PointTruth:
     expected, advice = "the arrays 'points' and 'labels', points of all surfaces", "make the room again"
     arrays = read_arrays(file, expected, advice)
     names = read_json(folder / "classes.json")
-    try:
+    with reading(file, expected, advice):
         points, labels = arrays["points"], arrays["labels"].astype(np.int64)
         return PointTruth(torch.from_numpy(points), torch.from_numpy(labels), dict(enumerate(names)))
-    except (ValueError, KeyError, TypeError) as error:
-        raise ValueError(f"{file}: expected {expected}, but it cannot be read ({error}); {advice}") from error

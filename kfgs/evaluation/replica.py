@@ -112,14 +112,9 @@ def load_semantic_nerf_labels(path: str | Path, info: str | Path | None = None) 
 def read_replica_info(path: Path) -> tuple[dict[int, str], dict[int, int]]:
     """The classes by id, and the class of each object (-1 = none)."""
     top = read_json(path)
-    try:
+    with reading(path, "Replica's classes ('id', 'name') and objects ('id', 'class_id')", "copy the file again"):
         names = {int(entry["id"]): str(entry["name"]) for entry in top["classes"]}
         of_object = {int(entry["id"]): int(entry["class_id"]) for entry in top["objects"]}
-    except (TypeError, KeyError, ValueError, OverflowError) as error:
-        raise ValueError(
-            f"{path}: expected Replica's classes ('id', 'name') and objects ('id', 'class_id'), got something else ({error}); "
-            "copy the file again"
-        ) from error
     if not names:
         raise ValueError(f"{path}: expected classes, got none; copy the file again")
     unknown = sorted({label for label in of_object.values() if label > 0 and label not in names})
