@@ -96,8 +96,12 @@ def test_the_rule_for_labels_is_that_of_the_protocol_unless_asked(run, room, wor
     published, own = (evaluate(run, question, encode=words, labels=rule) for rule in (None, "own"))
     assert (published.options["labels"], published.changed) == ("nearest", ("texts",))
     assert (own.options["labels"], own.changed) == ("own", ("texts", "labels"))
-    papers = evaluate(run, open_question(room, "df3dgs"), encode=words)
+    papers = evaluate(run, question := open_question(room, "df3dgs"), encode=words)
     assert (papers.options["labels"], papers.changed) == ("paper", ())
+    assert [view.stem for view in question.views] == [question.scene.stem(0)]  # whatever the scene's own split is
+    trained = field.info["views"]
+    both = trained.count(question.scene.cameras[5].name)
+    assert f"split df3dgs: {both} of the {len(trained)} views trained are its train views" in papers.notes
     method = FieldMethod(field, rule="nearest")
     pooled = open_question(room)
     assert evaluate(method, pooled, encode=words).options["labels"] == "nearest"  # its rule, unless one is asked

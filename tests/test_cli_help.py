@@ -119,10 +119,8 @@ def test_an_option_that_the_docs_name_exists(name):
 def test_a_home_folder_is_understood_everywhere(monkeypatch, tmp_path, capsys):
     monkeypatch.setenv("HOME", str(tmp_path))
     (tmp_path / "words.txt").write_text("wall\nfloor\n")
-    assert (
-        cli.main(["features", "--words", "~/words.txt", "--teacher", "cases_text:TEACHER", "--out=~/t.safetensors"])
-        == 0
-    )
+    words = ["--words", "~/words.txt", "--teacher", "cases_text:TEACHER", "--out=~/t.safetensors"]
+    assert cli.main(["features", *words]) == 0
     assert (tmp_path / "t.safetensors").is_file()
     assert cli.main(["convert", "~/nothing"]) == 1
     assert f"{tmp_path}/nothing" in capsys.readouterr().err

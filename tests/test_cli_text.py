@@ -117,10 +117,8 @@ def test_any_phrase_with_a_teacher_and_no_table(field, truth, names, capsys):
     assert main(["select", "LAMP", str(field), *LETTERS]) == 0
     said = capsys.readouterr().out
     assert "more like the query than like any of 4 negatives" in said
-    field_rows, lamp = (
-        SemanticField.load(field).latents.double(),
-        letters(["lamp", *["object", "things", "stuff", "texture"]]),
-    )
+    field_rows = SemanticField.load(field).latents.double()
+    lamp = letters(["lamp", *["object", "things", "stuff", "texture"]])
     cosine = torch.nn.functional.normalize(field_rows, dim=1) @ torch.nn.functional.normalize(lamp.double(), dim=1).T
     expected = int((cosine[:, 0] > cosine[:, 1:].amax(dim=1) + 1e-6).sum())
     assert f"LAMP: {expected} of 4000 Gaussians" in said
@@ -137,10 +135,7 @@ def test_words_of_another_teacher_are_noted(field, names, tmp_path, capsys):
     assert "note: --text: expected those of the field's teacher, got text of another teacher (name 'clip'" in said
     assert main(["select", "palm", str(field), "--text", str(table), *LETTERS]) == 0
     said = capsys.readouterr().out
-    assert (
-        "note: --text: expected a table by the query's teacher (from --teacher and --weights), got one by another"
-        in said
-    )
+    assert "note: --text: expected a table by the query's teacher (from --teacher and --weights), got one by" in said
     assert "they cannot be compared: use the table's teacher for the query" in said
     assert "field's teacher" not in said  # the query is of the field's own
 

@@ -15,10 +15,11 @@ from typing import Any, ClassVar
 
 import torch
 
-from .._check import ORIGIN
+from .._check import ORIGIN, check_whole
 from .._origin import recounted
 from ..gaussians import Gaussians
 from ..scenes import Scene
+from ..scenes.load import SplitChoice
 from .color import COLOR_PROTOCOL, score_views
 from .find import find_points
 from .method import LabelRule, Method, View, annotated, best_labels, check_level, label_view
@@ -27,7 +28,7 @@ from .segmentation import PROTOCOL, evaluate_segmentation
 from .surface import ABOUT, NAME, score_surface
 from .teacher_agreement import TeacherAgreement
 from .texts import Encode, encode_unit
-from .truth import LabelTruth, Merged, PointTruth, is_void, merge_table
+from .truth import LabelTruth, Merged, PointTruth, is_void, merge_table, name_key
 from .views import label_views
 
 
@@ -48,13 +49,17 @@ class KfgsPooled:
     most: int | None = None
     """Average the IoU of this many classes, those with most true pixels (ties by name); None: of all that occur."""
 
+    def __post_init__(self) -> None:
+        check_whole("most", 1 if self.most is None else self.most, 1)
+
     def score(self, method: Method, truth: LabelTruth, views: Sequence[View], encode: Encode) -> Report:
         """Segment each view that has a label picture."""
         text, cameras = encode_unit(encode, truth.names), {view.stem: view for view in annotated(views, truth.maps)}
-        answer = partial(label_view, method, text=text, level=self.level)
-        scored = evaluate_segmentation(
-            lambda stem: answer(cameras[stem]).cpu(), truth.maps, truth.names, merged=self.merged
+        answer, keys = partial(label_view, method, text=text, level=self.level), set(map(name_key, truth.names))
+        merged = tuple(  # a scene need not have the classes of the published pairs
+            pair for pair in self.merged if pair not in type(self).merged or keys.issuperset(map(name_key, pair))
         )
+        scored = evaluate_segmentation(lambda stem: answer(cameras[stem]).cpu(), truth.maps, truth.names, merged=merged)
         pixels = (scored.confusion.sum(dim=1) + scored.misses).tolist()
         chosen = [i for i, iou in enumerate(scored.iou.tolist()) if iou == iou]
         if self.most is not None:
@@ -75,6 +80,8 @@ class DF3DGS(KfgsPooled):
         "(ties by name); all classes are asked; accuracy over all pixels"
     )
     rule: ClassVar[LabelRule] = "paper"
+    scene_split: ClassVar[SplitChoice] = "df3dgs"
+    """The split whose test views are scored, whatever lists the scene has (`pipeline.open_question`)."""
 
     merged: Merged = (("rugs", "floor"), ("rug", "floor"))
     most: int | None = 10

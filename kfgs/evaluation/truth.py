@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from .._card import short_repr
-from .._check import ORIGIN, check_shapes
+from .._check import ORIGIN, check_choice, check_shapes
 from .._origin import choose_origin
 
 T = TypeVar("T")
@@ -75,9 +75,18 @@ class ReadWhenAsked(Mapping[str, T]):
 
 
 def merge_table(names: Sequence[str], merged: Merged) -> Tensor:  # [C + 1] int64
-    """The class that each class counts as, itself by default; -1 at the end. Names by `name_key`, chains are followed."""
-    keys, table = [name_key(name) for name in names], [*range(len(names)), -1]
-    becomes = {name_key(old): keys.index(name_key(new)) for old, new in merged if name_key(new) in keys}
+    """The class that each class counts as, itself by default; -1 at the end. Names by `name_key`, chains are followed.
+
+    A ValueError for what is not a pair of classes, and for pairs that go round in a circle.
+    """
+    keys, table, becomes = [name_key(name) for name in names], [*range(len(names)), -1], dict[str, int]()
+    for pair in merged:
+        if not isinstance(pair, tuple | list) or [type(name) for name in pair] != [str, str]:
+            raise ValueError(f"merged: expected pairs of names, got {pair!r:.80}; for instance (('rug', 'floor'),)")
+        for name in pair:
+            if name_key(name) not in keys:
+                check_choice("merged", name, names)
+        becomes[name_key(pair[0])] = keys.index(name_key(pair[1]))
     for _ in becomes:
         table = [becomes.get(keys[i], i) if i >= 0 else i for i in table]
     if any(keys[i] in becomes for i in table[:-1]):

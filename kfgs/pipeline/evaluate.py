@@ -27,6 +27,8 @@ from ..formats import read_splats
 from ..gaussians import Gaussians
 from ..labels import LabelSet
 from ..scenes import FeatureFolder, Scene, load_scene
+from ..scenes.load import SplitChoice
+from ..scenes.scene import make_split
 from .maps import maps_of_views
 
 MAPS = ("features.json", "*_fmap_CxHxW.pt", "*.npy")  # files in a folder of feature maps
@@ -64,15 +66,16 @@ def open_question(
         protocol: a name of `kfgs.evaluation.protocols.PROTOCOLS`, or a protocol.
         truth: where the ground truth is, if not in the scene's folder (`find_labels`, `find_points`). For
             `feature3dgs-teacher/1` the folder of the teacher's maps; None: `features/` in the scene.
-        split: which views. None depends on the protocol: the test views, or all views with labels if no test view has
-            some; of a teacher's maps all views.
+        split: which views of the scene's own splits. None depends on the protocol: the test views (`df3dgs/1`: those of the
+            paper's split), or all views with labels if no test view has some; of a teacher's maps all views.
         images: folder of the pictures.
 
     A FileNotFoundError if the scene or its truth is missing, a ValueError if protocol, split or truth do not fit.
     """
     protocol = get_protocol(protocol) if isinstance(protocol, str) else protocol
     folder, place = as_path(scene), None if truth is None else as_path(truth)
-    loaded = load_scene(folder, images=images).undistorted()
+    rule: SplitChoice = "auto" if split is not None else getattr(protocol, "scene_split", "auto")
+    loaded = load_scene(folder, images=images, split=rule).undistorted()
     if not isinstance(protocol, TeacherAgreement):
         return Question(protocol, loaded, *protocol.open(loaded, folder, place, split))
     maps = place or folder / "features"
@@ -129,7 +132,7 @@ def evaluate(
         used = getattr(method, "rule", "own")
         unusual = ("labels",) if used != rule else ()
         report = replace(report, options={**report.options, "labels": used}, changed=(*report.changed, *unusual))
-    notes = (*report.notes, *_notes(question.scored, method, encode))
+    notes = (*report.notes, *_notes(question, method, encode))
     return replace(report, notes=notes, command=command, machine=this_machine())
 
 
@@ -162,12 +165,20 @@ def _read_teacher(folder: Path, scene: Scene, views: Sequence[View], *, align_co
     return TeacherMethod(by_stem, f"teacher ({folder.name})", align_corners=align_corners)
 
 
-def _notes(views: Sequence[View], method: Any, encode: Any) -> list[str]:
+def _notes(question: Question, method: Any, encode: Any) -> list[str]:
     """Facts that decide how a score is to be read; what is not known is left out."""
+    views, scene = question.scored, question.scene
     field = method.field if isinstance(method, FieldMethod) else None
     names = [] if field is None else field.info.get("views") or [camera.name for camera in field.cameras]
-    trained = {file_stem(str(name)) for name in names} & {view.stem for view in views}
-    notes = [f"{len(trained)} of {len(views)} scored views were trained on"] if trained else []
+    trained, scored = {file_stem(str(name)) for name in names}, {view.stem for view in views}
+    both = len(trained & scored)
+    notes = [f"{both} of {len(views)} scored views were trained on"] if both else []
+    split = getattr(question.protocol, "scene_split", None)
+    parts = {} if split is None else make_split(len(scene), split)
+    for name, stems, what in (("test", scored, "scored"), ("train", trained, "trained")):
+        own = {scene.stem(i) for i in parts.get(name, ())}
+        if own and stems:
+            notes.append(f"split {split}: {len(own & stems)} of the {len(stems)} views {what} are its {name} views")
     sizes = sorted({view.camera.size for view in views}, key=lambda size: size[0] * size[1])
     if sizes:
         several = [f"{height}x{width}" for height, width in dict.fromkeys((sizes[0], sizes[-1]))]

@@ -136,9 +136,6 @@ def _open_maps(maps: Any, scene: Scene, split: str, folder: Path, progress: bool
     return maps
 
 
-# Uplift: fuse first, compress after.
-
-
 def _uplift(
     run: Run, scene: Scene, views: list[int], maps: FeatureMaps, method: Uplift
 ) -> tuple[SemanticField, dict[str, Any]]:
@@ -183,13 +180,10 @@ def _geometry(run: Run, scene: Scene, views: list[int], method: Uplift) -> tuple
     return gaussians, {"geometry": "trained on the pictures", "steps": {"color": steps}}
 
 
-# Paper: compress each map, then train Gaussians on the compressed maps (Figure 2).
-
-
 def _paper(
     run: Run, scene: Scene, views: list[int], maps: FeatureMaps, method: Paper
 ) -> tuple[SemanticField, dict[str, Any]]:
-    """Codebook, index maps, autoencoder, Gaussians trained on the latent maps, and what the views show of each Gaussian."""
+    """Figure 2: codebook, index maps, autoencoder, Gaussians trained on the latent maps, and what the views show of each."""
     targets: Sequence[Tensor] = KnownFeatures(maps)
     decoder: Decoder = Identity(map_shape(maps)[-1])
     features, device = {"features": describe_maps(run, maps)}, training_device()
@@ -216,16 +210,15 @@ def _paper(
     cameras, training = [scene.cameras[i] for i in views], with_extent(method.training, scene)
     inputs |= {"scene": digest_scene(scene, views), "config": asdict(training), "seed": run.seed}
     start = partial(gaussians_from_points, scene.points, decoder.latent)
-    trained = field_stage(
-        run, "field", inputs, start, partial(fit_field, cameras=cameras, targets=targets, training=training)
-    )
+    train = partial(fit_field, cameras=cameras, targets=targets, training=training)
+    trained = field_stage(run, "field", inputs, start, train)
     field = SemanticField(stage_gaussians(trained), decoder)
-    answers = run.stage(
-        "answers", {"field": trained.key}, lambda folder: fuse_views(field, cameras).save(folder / NAME)
-    )
-    kind, changed = method.codebook and type(method.codebook).__name__, ", ".join(changes(method, Paper.paper()))
-    about = {"method": "paper", "codebook": kind, "changed_from_paper": changed or "nothing"}
-    return SemanticField.load(answers.folder), about | {"steps": {"field": training.steps}}
+    fuse = partial(fuse_views, field, cameras)
+    answers = run.stage("answers", {"field": trained.key}, lambda folder: fuse().save(folder / NAME))
+    book_kind = None if method.codebook is None else type(method.codebook).__name__
+    changed = ", ".join(changes(method, Paper.paper())) or "nothing"
+    facts = {"method": "paper", "codebook": book_kind, "changed_from_paper": changed}
+    return SemanticField.load(answers.folder), facts | {"steps": {"field": training.steps}}
 
 
 def _learn(

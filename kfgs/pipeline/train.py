@@ -70,11 +70,7 @@ def with_points(run: Run, scene: Scene, views: Sequence[int]) -> Scene:
     if len(scene.points) >= FEW_POINTS:
         return scene
     seen, everything = scene.select(views), range(len(views))
-    inputs = {
-        "pictures": digest_pictures(run, seen, everything),
-        "scene": digest_scene(seen, everything),
-        "seed": run.seed,
-    }
+    inputs = {"pictures": digest_pictures(run, seen, everything), "scene": digest_scene(seen, everything)}
 
     def make(folder: Path) -> None:
         run.say(
@@ -91,7 +87,7 @@ def with_points(run: Run, scene: Scene, views: Sequence[int]) -> Scene:
         made = made if len(made.points) > len(scene.points) else scene
         save_tensors(folder / "points.safetensors", {"points": made.points, "colors": made.colors})
 
-    tensors = read_safetensors(run.stage("points", inputs, make).folder / "points.safetensors")[0]
+    tensors = read_safetensors(run.stage("points", inputs | {"seed": run.seed}, make).folder / "points.safetensors")[0]
     scene = replace(scene, points=tensors["points"], colors=tensors["colors"])
     check_scene(scene, views, few=1)
     return scene

@@ -62,6 +62,9 @@ def test_the_papers_score_merges_rugs_and_averages_the_ten_classes_with_most_tru
     assert KfgsPooled(merged=(("Rug", "Floor"),), most=10).score(method, *asked).scores == report.scores
     assert merge_table(NAMES, (("a", "b"), ("b", "c"))).tolist() == [2, 2, 2, -1]
     refused(lambda: merge_table(NAMES, (("a", "b"), ("b", "a"))), "merged: expected", "circle")
+    refused(lambda: merge_table(names, (("rug", "flor"),)), "merged: expected", "got 'flor'; did you mean 'floor'?")
+    refused(lambda: KfgsPooled(merged=("rug", "floor")).score(method, *asked), "merged: expected pairs", "got 'rug'")
+    refused(lambda: get_protocol("df3dgs", most=0), "most: expected", "got 0")
     assert KfgsPooled().score(method, *asked)["accuracy"] < report["accuracy"]
 
 
