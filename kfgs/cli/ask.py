@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -93,14 +93,18 @@ def select(
         for name in {"parts.png", "selection.ply.classes.json"} - set(written):
             (out / name).unlink(missing_ok=True)  # of an older selection
     say(headline)
-    named = not is_field(source) and threshold is None  # parts are numbered as `kfgs edit` does
+    say_parts(parts, None if is_field(source) or threshold is not None else query)
+    if out is not None:
+        wrote([out / name for name in written])
+
+
+def say_parts(parts: Sequence[Any], name: str | None) -> None:
+    """List parts, each with its number as `kfgs edit` counts the parts of a class, if its `name` is given."""
     for part in parts:
-        say(f"  {query}/{part.number}: {part!r}" if named else f"  {part!r}")
+        say(f"  {part!r}" if name is None else f"  {name}/{part.number}: {part!r}")
     left = parts[0].total - len(parts) if parts else 0
     if left:
         say(f"  {left} smaller part{'s are' if left > 1 else ' is'} not listed")
-    if out is not None:
-        wrote([out / name for name in written])
 
 
 def words_of(classes: Classes, teacher: Teacher, field: Any) -> tuple[Any, Callable[[str], Any] | None]:
@@ -119,8 +123,7 @@ def words_of(classes: Classes, teacher: Teacher, field: Any) -> tuple[Any, Calla
     templates = None if label_set is None else label_set.info.get("templates")
     asked = kfgs.make_label_set(network, ["thing"], templates=templates)
     label_set = label_set or asked
-    difference = teacher_mismatch(asked.info, label_set.info)
-    if difference is not None:
+    if (difference := teacher_mismatch(asked.info, label_set.info)) is not None:
         say(
             "note: --text: expected a table by the query's teacher (from --teacher and --weights), got one by another "
             f"({difference}); they cannot be compared: use the table's teacher for the query, or pass a table of the "

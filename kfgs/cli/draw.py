@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import kfgs
 
@@ -15,9 +15,6 @@ from .._files import check_output, write_json
 from .ask import open_colors, open_meaning
 from .files import is_field, open_field, say, wrote
 from .options import Classes, Flag, Given, Positional, Teacher, Walk, Word
-
-if TYPE_CHECKING:
-    from ..cameras import Camera
 
 KEYS = 40  # cameras of a long walk that become keys: enough to follow it, few enough to smooth out a shaking hand
 FPS = 15.0
@@ -100,7 +97,7 @@ def _opened(names: Any, semantic: Any, colors: Any) -> tuple[Any, Any]:
     return shown, None if colors is None else shown if colors is semantic else kept(colors)
 
 
-def read_walk(path: Walk, frames: int | None) -> Callable[[Any, list[Camera]], list[Camera]]:
+def read_walk(path: Walk, frames: int | None) -> Callable[[Any, list[kfgs.Camera]], list[kfgs.Camera]]:
     """Read the cameras of a file or folder, before anything else is read; the walk follows from the cloud and its cameras."""
     from .._check import check_whole
     from ..cameras import Orbit, orbit_cameras, path_cameras
@@ -108,7 +105,7 @@ def read_walk(path: Walk, frames: int | None) -> Callable[[Any, list[Camera]], l
     from ..scenes.load import is_scene
     from ..viz.linked import upwards
 
-    own: list[Camera] = []
+    own: list[kfgs.Camera] = []
     if frames is not None:
         check_whole("frames", frames, 2)
     if isinstance(path, Path):
@@ -120,7 +117,7 @@ def read_walk(path: Walk, frames: int | None) -> Callable[[Any, list[Camera]], l
         own = load_cameras(path)
         own = own if frames is None else path_cameras(own, frames, size=own[0].size)
 
-    def walk(cloud: Any, cameras: list[Camera]) -> list[Camera]:
+    def walk(cloud: Any, cameras: list[kfgs.Camera]) -> list[kfgs.Camera]:
         if own:  # the size of the scene, not that of the path, says what is too near to be drawn
             near = min((camera.near for camera in cameras), default=own[0].near)
             return [replace(camera, near=near) for camera in own]
@@ -129,9 +126,8 @@ def read_walk(path: Walk, frames: int | None) -> Callable[[Any, list[Camera]], l
             orbit = Orbit(frames=frames or FRAMES, size=size, elevation_degrees=45, zoom=1.5, cut=0.6)
             return orbit_cameras(cloud.means, orbit, up=upwards(cameras), origin=cloud.origin)
         if not cameras:
-            raise ValueError(
-                f"scene: expected --scene for --path {path}, whose cameras it needs, got none; or take an orbit"
-            )
+            advice = "or take an orbit"
+            raise ValueError(f"scene: expected --scene for --path {path}, whose cameras it needs, got none; {advice}")
         cameras = [camera.with_origin(cloud.origin) for camera in cameras]
         size = (max(1, round(WIDTH * cameras[0].height / cameras[0].width)), WIDTH)
         return path_cameras(cameras, frames or FRAMES, every=max(1, round(len(cameras) / KEYS)), size=size)
@@ -184,9 +180,8 @@ def segment(
         out: Folder for label maps (predicted/ has class numbers, colored/ shows them in colours), pictures and scores.json. It
             holds the results; files of the same names are replaced.
         split: Which views: train, test, all, or another split that SCENE/split.json names.
-        path: Segment the cameras of a path instead of the views of a split: orbit or cameras, as in `kfgs render`; or a
-            file or folder with cameras of your own (transforms.json, COLMAP model, scene; without pictures, too): exactly
-            these, or with --frames a smooth path through them.
+        path: Segment the cameras of a path instead of the views of a split: orbit, cameras, or a file or folder with cameras
+            of your own, all as in `kfgs render`.
         frames: Number of cameras of the path; by default 72, or your own cameras.
         coco: Write coco/annotations.json (COCO's run lengths, areas and boxes; one annotation for each class of each picture)
             and its pictures to coco/images: undistorted photographs, or with --path rendered colours.
@@ -202,17 +197,15 @@ def segment(
     loaded = open_field("field", field)
     classes = classes.of(loaded)
     scene, label_set = classes.loaded, classes.load_classes(loaded)
-    assert classes.scene is not None
-    labels = scored_labels(classes.scene, label_set, say)
+    labels = scored_labels(scene.folder, label_set, say)
     truth = {} if labels is None else true_labels(scene, labels, split)
-    views = {scene.stem(i): i for i in scene.views(split)}
-    seen = set(loaded.info.get("views", ())) & {scene.cameras[i].name for i in views.values()}
+    seen = set(loaded.info.get("views", ())) & {scene.cameras[i].name for i in scene.views(split)}
     if seen:
         say(f"note: the field was trained on {len(seen)} of these views")
     maps = kfgs.segment_scene(loaded, scene, label_set, out, split=split, truth=truth, progress=True)
     written = [out / name for name in ("predicted", "colored", "sheets")]
     if coco:
-        written.append(write_coco(out, maps, label_set.names, lambda stem: scene.image(views[stem])))
+        written.append(write_coco(out, maps, label_set.names, scene.image))
     if truth:
         scores = kfgs.score_scene(maps, truth, label_set)
         write_json(out / "scores.json", {"segmentation": scores.to_json(), "truth": str(labels), "field": str(field)})

@@ -15,6 +15,7 @@ from .._files import check_output, real_path
 from .._notes import Wait, hear
 
 OUTPUTS = ("out", "target")  # parameters that name what a command writes
+SORTED = "neighbours now lie side by side (Morton order), so indices into the old"
 LINE, END = 2000, 600
 """Most characters of a printed line, and how many of them are from its end, where an error says what to do."""
 
@@ -36,20 +37,15 @@ def check_outputs(given: Mapping[str, Any], made: str | None = None) -> None:
         for scene in (path for path in (*read, *place.parents) if is_scene(path)):
             for part in (scene_root(scene) / part for part in SCENE_PARTS if part != made):
                 if real_path(part) in (place, *place.parents):
-                    raise ValueError(
-                        f"{name}: expected a place apart from {part}, a part of a scene, got {target}; give another"
-                    )
+                    apart = f"apart from {part}, a part of a scene"
+                    raise ValueError(f"{name}: expected a place {apart}, got {target}; give another")
 
 
 def check_target(name: str, target: Path) -> None:
     """Raise a ValueError unless `target` can become a splat file."""
-    from ..formats.table import formats
+    from ..formats.table import find_writer
 
-    endings = tuple(ending for kind in formats().values() if hasattr(kind, "write") for ending in kind.SUFFIXES)
-    if not target.name.lower().endswith(endings):
-        raise ValueError(
-            f"{name}: expected a file whose name ends in one of {', '.join(endings)}, got {target}; the ending chooses the format"
-        )
+    find_writer(target, name)
     check_output(name, target, "a file")
 
 
@@ -67,9 +63,8 @@ def open_field(name: str, path: Path) -> Any:
     field = find_field(path)
     if field is None:
         what = "a file" if path.is_file() else "a folder without one" if path.is_dir() else "no such file"
-        raise ValueError(
-            f"{name}: expected a field (RUN/field.kfgs, or RUN), got {path}, {what}; make one with `kfgs fit`"
-        )
+        got = f"{path}, {what}; make one with `kfgs fit`"
+        raise ValueError(f"{name}: expected a field (RUN/field.kfgs, or RUN), got {got}")
     return kfgs.SemanticField.load(field)
 
 
@@ -81,9 +76,8 @@ def open_splats(name: str, path: Path, *, labelled: bool = False, named: bool = 
         raise ValueError(f"{name}: expected a splat file, got {path}, a semantic field; pass what `kfgs color` writes")
     splats = kfgs.read_splats(path)
     if (labelled or named) and splats.labels is None:
-        raise ValueError(
-            f"{name}: expected a splat with classes, got {path} without; run `kfgs attach FIELD {path} --out labelled.ply`"
-        )
+        advice = f"run `kfgs attach FIELD {path} --out labelled.ply`"
+        raise ValueError(f"{name}: expected a splat with classes, got {path} without; {advice}")
     if named and not splats.names:
         raise ValueError(
             f"{name}: expected the names of its classes in {beside(path, NAMES)}, got no such file; copy it from where the "
@@ -100,10 +94,9 @@ def say(text: str, file: TextIO | None = None) -> None:
     """
     try:
         print("\n".join(map(_shown, text.split("\n"))), file=file or sys.stdout, flush=True)
-    except BrokenPipeError:
-        raise
     except OSError as error:
-        raise OSError(error.errno, error.strerror, "standard output") from error
+        error.filename = None if isinstance(error, BrokenPipeError) else "standard output"
+        raise
 
 
 def _shown(line: str) -> str:
@@ -122,12 +115,12 @@ def wrote(paths: Sequence[Path]) -> None:
         say(f"  {path}" + (f"  ({sum(1 for p in path.iterdir())} files)" if path.is_dir() else ""))
 
 
-def say_lost(written: Any) -> None:
-    """Report what the format of a splat file (`Written`) could not store, and whether it reordered the Gaussians."""
-    for words in written.lost:
+def say_lost(*files: Any) -> None:
+    """Report what the formats of splat files (`Written`) could not store, and whether they reordered the Gaussians."""
+    for words in dict.fromkeys(words for written in files for words in written.lost):
         say(f"note: {words}")
-    if written.order is not None:
-        say("note: neighbours now lie side by side (Morton order), so indices into the old file do not fit the new one")
+    if any(written.order is not None for written in files):
+        say(f"note: {SORTED} file do not fit the new one")
 
 
 @contextmanager

@@ -12,7 +12,7 @@ from typing import Any, Literal
 import kfgs
 
 from .._files import atomic_folder, check_output
-from .files import check_target, is_field, open_field, open_splats, say, say_lost, wrote
+from .files import SORTED, check_target, is_field, open_field, open_splats, say, say_lost, wrote
 from .options import Classes, Flag, Given, Positional, Several
 
 PICTURES = 2  # views that `kfgs edit` shows
@@ -89,9 +89,8 @@ def attach(
         wrote(paths)
         return
     splats = open_splats("cloud", cloud)
-    scene, cameras = classes.loaded, None
-    if scene is not None and not loaded.cameras:
-        cameras = [scene.cameras[i] for i in scene.views("train")]
+    scene = classes.loaded
+    cameras = None if scene is None or loaded.cameras else scene.select("train").cameras
     frame: Any = Similarity.identity() if same_frame else None
     if splat_scene is not None:
         frame = kfgs.load_scene(splat_scene).undistorted().cameras
@@ -213,9 +212,8 @@ def parse_edits(asked: Edits, names: Sequence[str] = ()) -> list[Any]:
 def _split(option: str, words: str, example: str) -> tuple[str, str]:
     name, colon, value = words.rpartition(":")
     if not (name and colon and value):
-        raise ValueError(
-            f"{option}: expected a class and a value, as in {example!r}, got {words!r}; put a colon between"
-        )
+        expected = f"a class and a value, as in {example!r}"
+        raise ValueError(f"{option}: expected {expected}, got {words!r}; put a colon between")
     return name, value
 
 
@@ -252,7 +250,7 @@ def convert(
         by_class: TARGET is a folder that receives one plain .ply for each class, 05_chair.ply for class 5.
     """
     from ..batch.run import describe_batch
-    from ..fields.store import check_place, read_description
+    from ..fields.store import read_description
     from ..pipeline.attach import save_labelled
     from ..pipeline.describe import describe
 
@@ -264,29 +262,24 @@ def convert(
         wrote(save_labelled(target, labelled, rule="what the views show of each Gaussian; score = cosine"))
     elif is_field(source) or target.suffix == ".kfgs":
         check_output("target", target, "a file")
-        check_place(target)
-        field = open_field("source", source)
-        field.save(target, None if precision == "lossless" else precision)
+        open_field("source", source).save(target, None if precision == "lossless" else precision)
         if precision != "lossless":
             about = read_description(target)
             for name, error in about["info"]["rounded"][-1]["errors"].items():
                 unit = UNITS.get(name, "of a row's typical number")
                 say(f"  {name:<32s} within {error:.3g} {unit}")
             say(f"{about['gaussians']:,} Gaussians in {target.stat().st_size / 2**20:.2f} MiB")
-            say(
-                "note: neighbours now lie side by side (Morton order): indices into the old field do not fit the new one"
-            )
+            say(f"note: {SORTED} field do not fit the new one")
         wrote([target])
     elif by_class:
         _convert_by_class(source, target)
     else:
         check_target("target", target)
         splats = open_splats("source", source)
-        shown = repr(splats)
         written = kfgs.write_splats(splats, target, plain=plain)
-        say(shown)
+        say(repr(splats))
         say_lost(written)
-        say(f"{_bytes_of(source) / 2**10:,.1f} KiB -> {_bytes_of(target) / 2**10:,.1f} KiB")
+        say(f"{len(splats):,} Gaussians in {target.stat().st_size / 2**20:.2f} MiB")
         wrote(written.paths)
 
 
@@ -309,11 +302,5 @@ def _convert_by_class(source: Path, folder: Path) -> None:
         written = [kfgs.write_splats(part, new / name, plain=True) for name, part in parts.items()]
     for name, part in parts.items():
         say(f"{name}: {len(part)} Gaussians")
-    for words in dict.fromkeys(words for file in written for words in file.lost):
-        say(f"note: {words}")
+    say_lost(*written)
     wrote([folder / path.name for file in written for path in file.paths])
-
-
-def _bytes_of(path: Path) -> int:
-    """Bytes of a file, or of all files in a folder."""
-    return sum(file.stat().st_size for file in (path, *path.rglob("*")) if file.is_file())

@@ -78,9 +78,8 @@ def _read_section(
     rows_at = centres_at + s.bucket_bytes * s.buckets
     end = rows_at + s.capacity * record.itemsize
     if end > len(data):
-        raise ValueError(
-            f"a section has room for {s.capacity} Gaussians, to byte {end} of {len(data)}: it is truncated"
-        )
+        room = f"{s.capacity} Gaussians, to byte {end} of {len(data)}"
+        raise ValueError(f"a section has room for {room}: it is truncated")
     rows = np.frombuffer(data, record, s.size, rows_at)
     means = rows["means"].astype(np.float32)
     if level > 0 and s.size:

@@ -76,11 +76,8 @@ def find_format(path: str | Path) -> ModuleType:
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such file; expected a splat file there")
     if path.is_file():
-        try:
-            with path.open("rb") as file:
-                head = file.read(_HEAD_BYTES).removeprefix(BOM_UTF8)
-        except OSError as error:  # Python names no file if reading fails
-            raise type(error)(f"{path}: expected a splat file that can be read ({error.strerror})") from error
+        with reading(path, "a splat file"), path.open("rb") as file:
+            head = file.read(_HEAD_BYTES).removeprefix(BOM_UTF8)
         marked = [module for module in known.values() if hasattr(module, "matches") and module.matches(head)]
         named = [module for module in known.values() if path.name.lower().endswith(module.SUFFIXES)]
         candidates = marked or [module for module in named if not hasattr(module, "MAGIC")]
@@ -91,6 +88,16 @@ def find_format(path: str | Path) -> ModuleType:
     names = ", ".join(f"{name} ({', '.join(module.SUFFIXES)})" for name, module in known.items())
     names += f", and folders with {' or '.join(PATTERNS)}"
     raise ValueError(f"{path}: expected a splat file of a known format, got something else; known are {names}")
+
+
+def find_writer(path: Path, name: str = "path") -> ModuleType:
+    """The format that a new file's ending chooses; a ValueError about the argument `name` if none has that ending."""
+    writers = [module for module in formats().values() if hasattr(module, "write")]
+    for module in writers:
+        if path.name.lower().endswith(module.SUFFIXES):
+            return module
+    endings = ", ".join(ending for module in writers for ending in module.SUFFIXES)
+    raise ValueError(f"{name}: expected a name that ends in one of {endings}, got {path}; it chooses the format")
 
 
 def read_splats(path: str | Path, *, strict: bool = False) -> Gaussians:
@@ -158,11 +165,7 @@ def write_splats(
     """
     check_gaussians(gaussians)
     path = as_path(path)
-    writers = [module for module in formats().values() if hasattr(module, "write")]
-    module = next((module for module in writers if path.name.lower().endswith(module.SUFFIXES)), None)
-    if module is None:
-        endings = ", ".join(ending for module in writers for ending in module.SUFFIXES)
-        raise ValueError(f"path: expected a name that ends in one of {endings}, got {path.name!r}; rename it")
+    module = find_writer(path)
     if plain and module.NAME != "ply":
         raise ValueError(f"plain: expected it for a file that ends in .ply, got {path}; leave it out")
     what, holds = ("a plain PLY", _PLAIN) if plain else (module.SUFFIXES[0], module.HOLDS)
