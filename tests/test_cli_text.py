@@ -13,7 +13,7 @@ from messages import refused, tells
 from PIL import Image
 
 from kfgs.cli import features, main
-from kfgs.cli.fit import read_words
+from kfgs.cli.features import read_words
 from kfgs.cli.options import Classes, Teacher, Views
 from kfgs.fields import SemanticField
 from kfgs.labels import load_label_set

@@ -84,7 +84,7 @@ def _names_and_rows(path: Path) -> None:
 
 
 def _words(path: Path) -> None:
-    from kfgs.cli.fit import read_words
+    from kfgs.cli.features import read_words
 
     read_words(str(path))
 

@@ -28,10 +28,10 @@ def described(command: Any) -> str:
 
 def options_of(command: Any) -> Iterator[tuple[str, str, list[tuple[str, str]]]]:
     """Title, text and options of each group of a command's options; an option is how it is written, and its help."""
-    command = cli.documented(command)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)
-        parser = tyro.extras.get_parser(command, prog=f"kfgs {command.__name__}", config=cli.STYLE)
+        run, prog = cli.documented(command), f"kfgs {command.__name__}"
+        parser = tyro.extras.get_parser(run, prog=prog, config=cli.STYLE)
     for group in parser._action_groups:
         rows = []
         for action in group._group_actions:

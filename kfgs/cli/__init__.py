@@ -19,6 +19,8 @@ import textwrap
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import is_dataclass
+from itertools import pairwise
+from pathlib import Path
 from typing import Any, get_type_hints
 
 import tyro
@@ -29,8 +31,9 @@ from .._card import error_line, short_of_memory
 from .._interrupts import interruptible
 from .ask import select, view
 from .draw import evaluate, render, segment
+from .features import features
 from .files import check_outputs, notes_as_lines, say
-from .fit import batch, color, demo, features, fit, sfm
+from .fit import batch, color, demo, fit, sfm
 from .splats import attach, convert, edit
 
 GROUPS: dict[str, tuple[Any, ...]] = {
@@ -67,9 +70,6 @@ def main(arguments: list[str] | None = None) -> int:
     words = [re.sub("^(--[^=]+=|)~(?=/|$)", lambda start: start[1] + home, word) for word in words]
     name, *given = [word for word in words if word != STRICT] or [""]
     command = COMMANDS.get("convert" if name == "info" else name)  # `kfgs info PATH`: convert without a target
-    if re.search("^--set[ =]help$", "\n".join(given).replace("--set\n", "--set "), re.MULTILINE):  # needs no scene
-        chosen = " ".join(re.findall("--(?:method|preset)[ =][a-z-]+", " ".join(given)))
-        given = ["SCENE", "--out=OUT", "--set=help", *chosen.split()]
     names = {} if command is None else shown_names(command)
     names |= {"classes": names.get("text", "classes"), "folder": names.get("out", "folder")}  # those of functions
 
@@ -91,6 +91,9 @@ def main(arguments: list[str] | None = None) -> int:
             raise SystemExit(2)
         elif any(word == "" or re.fullmatch("--[^=]+=", word) for word in given):
             raise ValueError("argument: expected a text, got an empty one; leave it out, or write . for this folder")
+        elif "set" in names and ("--set=help" in given or ("--set", "help") in pairwise(given)):  # needs no folders
+            listing, prog = documented(command, Path(), Path()), f"kfgs {name}"
+            tyro.cli(listing, prog=prog, args=given, config=STYLE, return_unknown_args=True)
         else:
             with interruptible(), notes_as_lines(lambda note: in_options(note, names), strict=STRICT in words):
                 about = _description(command)
@@ -113,20 +116,19 @@ def main(arguments: list[str] | None = None) -> int:
         return failed(f"expected enough memory, but it ran out ({error_line(error)}); {advice}")
 
 
-def documented(command: Callable[..., None]) -> Callable[..., None]:
-    """The command as tyro reads it: each option's text on one line. It refuses to write over what it reads."""
+def documented(command: Callable[..., None], *folders: Path) -> Callable[..., None]:
+    """The command, after its first `folders`, as tyro reads it: each option's text on one line. It writes over no input."""
+    signature = inspect.signature(functools.partial(command, *folders))
 
-    @functools.wraps(command)
     def run(*arguments: Any, **options: Any) -> None:
-        given = inspect.signature(command).bind(*arguments, **options).arguments
+        given = signature.bind(*arguments, **options).arguments
         groups = [vars(value) for value in given.values() if is_dataclass(value)]
         named = given | {name: value for group in groups for name, value in group.items()}
         check_outputs(named, "features" if command is features else None)
-        command(*arguments, **options)
+        command(*folders, *arguments, **options)
 
-    del run.__wrapped__  # tyro would read the text of the command itself
     run.__annotations__ = get_type_hints(command, include_extras=True)
-    vars(run)["__signature__"] = inspect.signature(command)
+    vars(run)["__signature__"] = signature
     run.__doc__ = re.sub(r"\n {8,}(?!kfgs)", " ", inspect.getdoc(command) or "")
     return run
 

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import ast
 import difflib
-import inspect
 import re
+from collections.abc import Mapping
 from contextlib import suppress
-from copy import deepcopy
 from dataclasses import dataclass, is_dataclass, replace
-from functools import cached_property, reduce
+from functools import cached_property
 from pathlib import Path
 from textwrap import fill
-from typing import Annotated, Any, Literal, TypeVar
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
+import docstring_parser
 import tyro
 from tyro.conf import Positional as Positional
 
@@ -30,9 +31,10 @@ Word = Annotated[str, tyro.conf.arg(metavar="NAME")]
 Name = Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="")]
 Several = Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="TEXT")]
 Walk = Literal["orbit", "cameras"] | Path  # paths of cameras
-SceneFolder = Annotated[
-    Path, Positional, tyro.conf.arg(help="Folder with images and a COLMAP model or transforms.json.")
-]
+Setting = tuple[list[type], str, str]  # an option for --set: the types of its values, its value as written, its text
+KINDS = {int, float, bool, str, tuple, NoneType}  # of such values
+SCENE_HELP = "Folder with images and a COLMAP model or transforms.json."
+SceneFolder = Annotated[Path, Positional, tyro.conf.arg(help=SCENE_HELP)]
 
 
 @dataclass(frozen=True)
@@ -51,58 +53,70 @@ class Settings:
             color = getattr(options, "color", options)
             color = replace(color, training=color.training.with_steps(self.steps))
             options = color if hasattr(options, "training") else replace(options, color=color)
+        table = settings_of(options)
         if "help" in self.set:
             say(f"Options of {chosen} and their values for --set; none leaves a whole group out:")
-            lines = [f"{name}={value}  {text}" for name, (_, value, text) in settable(options).items()]
+            lines = [f"{name}={written}  {text}" for name, (_, written, text) in table.items()]
             say("\n".join(fill(line, 98, subsequent_indent="    ") for line in lines))
             raise SystemExit(0)
-        options = deepcopy(options)
+        values: dict[str, Any] = {}
         for given in self.set:
             name, _, text = (part.strip() for part in given.lstrip("-").partition("="))
-            kinds = known_kinds(name := name.replace("-", "_"), options, f"an option of {chosen}, got {given!r}")
-            value: Any = text
+            name, value = name.replace("-", "_"), text
+            if name not in table:
+                raise ValueError(f"set: expected an option of {chosen}, got {given!r}; {hints_for(name, table)}")
+            kinds, *_ = table[name]
             with suppress(ValueError, SyntaxError):  # otherwise it is a text
                 value = ast.literal_eval(text.title() if text.lower() in ("none", "true", "false") else text)
-            value = float(value) if type(value) is int and "float" in kinds else value
-            if (str(value) if value is None else type(value).__name__) not in kinds:
-                raise ValueError(f"set: expected {name} as {' or '.join(kinds).lower()}, got {given!r}; give one")
-            *groups, field = name.split(".")
-            object.__setattr__(reduce(getattr, groups, options), field, value)  # of the copy
-        known = settable(options)
-        for place in {name[: name.rfind(".") + 1] for name in known}:
-            try:
-                replace(reduce(getattr, place.split(".")[:-1], options))  # checks the values
-            except ValueError as error:
-                kinds, *_ = known.get(f"{place}{error}".partition(": ")[0], ([], "", ""))
-                also = "; none is allowed, too" if "None" in kinds[1:] else ""
-                raise ValueError(f"set: {place}{error}{also}") from error
-        return options
+            values[name] = float(value) if type(value) is int and float in kinds else value
+            if type(values[name]) not in kinds:
+                words = ("none" if kind is NoneType else kind.__name__ for kind in kinds)
+                raise ValueError(f"set: expected {name} as {' or '.join(words)}, got {given!r}; give one")
+            if values[name] is None:  # a group that is left out has no options
+                table = {other: setting for other, setting in table.items() if not other.startswith(f"{name}.")}
+        return with_values(options, values, table)
 
 
-def settable(options: Any, place: str = "") -> dict[str, tuple[list[str], str, str]]:
-    """What --set can change, by name: the kinds of its values, the value as it is written, and its text."""
-    known: dict[str, tuple[list[str], str, str]] = {}
-    fields = r'^    (\w+): ([^=\n]+) = .*\n(?:    """((?s:.*?))""")?'  # as written, since only the source has the texts
-    for name, kind, text in re.findall(fields, inspect.getsource(type(options)), re.MULTILINE):
-        value, kinds = getattr(options, name), kind.replace("[int, ...]", "").split(" | ")
-        written = "none" if value is None or is_dataclass(value) else str(value).strip("()").replace(" ", "")
-        kinds = kinds[-1:] if is_dataclass(value) else kinds  # a group can only be left out
-        if set(kinds) <= {"int", "float", "bool", "str", "tuple", "None"}:
-            known[place + name] = (kinds, written, " ".join(text.split()))
-        known |= settable(value, f"{place}{name}.") if is_dataclass(value) else {}
-    return known
+def settings_of(options: Any, place: str = "") -> dict[str, Setting]:
+    """The table of all settings of a method or preset, by name, as in training.densify.maximum."""
+    table: dict[str, Setting] = {}
+    hints, documented = get_type_hints(type(options)), docstring_parser.parse_from_object(type(options)).params
+    texts = {entry.arg_name: " ".join((entry.description or "").split()) for entry in documented}
+    for name, value in vars(options).items():
+        members = get_args(hints[name]) if isinstance(hints[name], UnionType) else [hints[name]]
+        kinds, written = [get_origin(member) or member for member in members], str(value).strip("()").replace(" ", "")
+        if is_dataclass(value):  # a group, which can only be left out
+            kinds = [kind for kind in kinds if kind is NoneType]
+        if kinds and KINDS.issuperset(kinds):
+            written = "none" if value is None or is_dataclass(value) else written
+            table[place + name] = kinds, written, texts.get(name, "")
+        if is_dataclass(value):
+            table |= settings_of(value, f"{place}{name}.")
+    return table
 
 
-def known_kinds(name: str, options: Any, wrong: str) -> list[str]:
-    """The kinds of an option's values. A ValueError with the groups and similar names, or those of a symbol of the paper."""
-    known, symbol = settable(options), name.rpartition(".")[2]
-    if name in known:
-        return known[name][0]
-    alike = difflib.get_close_matches(symbol, {full.rpartition(".")[2] for full in known}, n=2)
+def hints_for(name: str, table: Mapping[str, Setting]) -> str:
+    """The groups of a table, and names that are like a wrong one, or whose text has it as a symbol of the paper."""
+    symbol = name.rpartition(".")[2]
+    alike = difflib.get_close_matches(symbol, {full.rpartition(".")[2] for full in table}, n=2)
     pattern = rf"\({re.escape(symbol)}[,)]"  # (alpha, Eq. 8)
-    near = [n for n in known if n.rpartition(".")[2] in alike or re.search(pattern, known[n][2], re.IGNORECASE)]
+    near = [n for n in table if n.rpartition(".")[2] in alike or re.search(pattern, table[n][2], re.IGNORECASE)]
     hint = f"did you mean {' or '.join(near)}?" if near else "--set help lists all"
-    raise ValueError(f"set: expected {wrong}; its groups: {', '.join({n.split('.')[0]: 0 for n in known})}; {hint}")
+    return f"its groups: {', '.join({n.split('.')[0]: 0 for n in table})}; {hint}"
+
+
+def with_values(options: Any, values: Mapping[str, Any], table: Mapping[str, Setting], place: str = "") -> Any:
+    """The options with new values by name; each group checks its own."""
+    new = {}
+    for name in {full.removeprefix(place).partition(".")[0] for full in values if full.startswith(place)}:
+        full = place + name
+        new[name] = values[full] if full in values else with_values(getattr(options, name), values, table, f"{full}.")
+    try:
+        return replace(options, **new)
+    except ValueError as error:
+        kinds, *_ = table.get(f"{place}{error}".partition(": ")[0], ([], "", ""))
+        also = "; none is allowed, too" if NoneType in kinds[1:] else ""
+        raise ValueError(f"set: {place}{error}{also}") from error
 
 
 @dataclass(frozen=True)
@@ -200,7 +214,6 @@ class Classes:
         """The scene of --scene or of the field, for its photographs; None if there is none, or it is gone."""
         if self.scene is not None or field is None:
             return self.loaded
-        try:
+        with suppress(OSError, ValueError):
             return self.of(field).loaded
-        except (OSError, ValueError):
-            return None
+        return None
