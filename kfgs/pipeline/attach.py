@@ -147,15 +147,19 @@ def attach(
         "similarity": similarity.matrix().tolist(),
         "counts": {"none": counts[0], **dict(zip(semantic.names, counts[1:], strict=True))},
     }
-    ways = [f"{how['shown']:,} got a class by the views"] if by == "views" else []
-    if transfer.labelled or not ways:
-        who = "that no view shows" if ways else "got a class"
-        ways.append(f"{transfer.labelled:,} {who} by distance (lambda {transfer.distance:.3g})")
-    note = f"{how['labelled by']}: of {len(splats):,} Gaussians {', '.join(ways)}, {transfer.orphaned:,} got none"
     labelled = without_instances(splats).replace(labels=labels, scores=scores.float(), names=semantic.names)
     if cameras:
         labelled = number_instances(labelled, [similarity.apply_to_camera(camera) for camera in cameras])
-    return Attached(labelled, transfer, similarity, alignment, (frame_note, note), facts)
+    return Attached(labelled, transfer, similarity, alignment, (frame_note, _count(splats, how, transfer)), facts)
+
+
+def _count(splats: Gaussians, how: dict[str, Any], transfer: Transfer) -> str:
+    """How many Gaussians got a class in which way."""
+    ways = [f"{how['shown']:,} got a class by the views"] if "shown" in how else []
+    if transfer.labelled or not ways:
+        who = "that no view shows" if ways else "got a class"
+        ways.append(f"{transfer.labelled:,} {who} by distance (lambda {transfer.distance:.3g})")
+    return f"{how['labelled by']}: of {len(splats):,} Gaussians {', '.join(ways)}, {transfer.orphaned:,} got none"
 
 
 def _common_frame(

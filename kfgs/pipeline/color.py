@@ -155,13 +155,9 @@ def color_stage(run: Run, scene: Scene, views: Sequence[int], config: ColorConfi
         sizes = [[max(1, round(n * config.picture_scale)) for n in camera.size] for camera in cameras]
         cameras = [camera.resized(*size) for camera, size in zip(cameras, sizes, strict=True)]
     start = partial(gaussians_from_points, scene.points, colors=scene.colors, sh_degree=config.sh_degree)
-    train = partial(
-        fit_field,
-        cameras=cameras,
-        targets=TrainingPictures(scene, views, cameras),
-        training=with_extent(config.training, scene),
-        loss=ColorLoss(config.ssim_weight),
-    )
+    pictures, loss = TrainingPictures(scene, views, cameras), ColorLoss(config.ssim_weight)
+    training = with_extent(config.training, scene)
+    train = partial(fit_field, cameras=cameras, targets=pictures, training=training, loss=loss)
     return stage_gaussians(field_stage(run, "color", _inputs(run, scene, views, config), start, train))
 
 
@@ -169,11 +165,8 @@ def find_color(run: Run, scene: Scene, views: Sequence[int], config: ColorConfig
     """Gaussians and steps of the longest colour stage of this scene in the run, if it has more steps than `config`."""
     free: dict[str, None] = {"config": None, "seed": None}
     wanted = json.loads(json.dumps(_inputs(run, scene, views, config) | free))
-    fitting = {
-        int(stage.inputs["config"]["training"]["steps"]): stage
-        for stage in run.finished("color")
-        if stage.inputs | free == wanted
-    }
+    alike = [stage for stage in run.finished("color") if stage.inputs | free == wanted]
+    fitting = {int(stage.inputs["config"]["training"]["steps"]): stage for stage in alike}
     steps = max(fitting, default=0)
     if steps <= config.training.steps:
         return None

@@ -9,11 +9,13 @@ from typing import Any
 from .._files import check_output, write_json
 from ..evaluation import find_points, score_views
 from ..evaluation.surface import score_surface
+from ..fields import SemanticField
 from ..fields.store import NAME
 from ..formats import write_splats
 from ..formats.ply import write_ply
+from ..gaussians import Gaussians
 from ..labels import EditList, OfClass, Recolor, Remove, connected_parts
-from ..scenes import FeatureFolder, load_scene
+from ..scenes import FeatureFolder, Scene, load_scene
 from ..toy.room_folder import ToyConfig, make_toy_room
 from ..viz.compare import views_of_change, write_comparison
 from .attach import attach, label_cloud, save_labelled
@@ -84,22 +86,28 @@ def run(
     assert gaussians.labels is not None
     surface = score_surface(gaussians.means, gaussians.labels, known.points.float(), known.labels)
     say(f"surface points: {surface}")
+    edited = _edit(out, field, colors, scene, say)
+    reports: dict[str, Any] = {"unseen_views": scores, "teacher": teacher, "surface": surface, "color": quality}
+    write_json(out / "scores.json", {name: value.to_json() for name, value in reports.items()})
+    pages = write_run_report(out / "run", field, scene, method, command="kfgs demo")
+    segmented = [out / "segmentation" / name for name in ("predicted", "colored", "sheets")]
+    return [out / "run" / NAME, *segmented, *written, out / "surface.ply", *pages, *edited, out / "scores.json"]
+
+
+def _edit(out: Path, field: SemanticField, colors: Gaussians, scene: Scene, say: Callable[[str], None]) -> list[Path]:
+    """Remove one class from the colours, paint another; the files of clouds and edits, and pictures of the changes."""
     say(
         f'5. Edits. The classes are carried over to the splat with the colours, and then "{REMOVED}" is a name for Gaussians: '
         f"the {REMOVED}s are removed, and the {PAINTED}s are painted red. What nobody saw behind a {REMOVED} is invented: the "
         "floor around it continues (fill). Pictures show the views that change most."
     )
     before = attach(field, colors).gaussians
-    edited = list(write_splats(before, out / "color.ply").paths)
+    written = list(write_splats(before, out / "color.ply").paths)
     for part in connected_parts(before, OfClass(REMOVED).select(before), field.cameras):
         say(f"  {REMOVED}: {part!r}")
     for name, edit in {"removed": Remove(REMOVED, fill=True), "recolored": Recolor(PAINTED, PAINT)}.items():
         after, file = edit.apply(before), out / f"{name}.ply"
-        edited += [*write_splats(after, file).paths, EditList((edit,)).save(out / f"{name}.ply.edits.json")]
+        written += [*write_splats(after, file).paths, EditList((edit,)).save(out / f"{name}.ply.edits.json")]
         views = [scene.cameras[i] for i in views_of_change(before, after, scene.cameras)]
-        edited.append(write_comparison(out / f"{name}.png", before, after, views))
-    reports: dict[str, Any] = {"unseen_views": scores, "teacher": teacher, "surface": surface, "color": quality}
-    write_json(out / "scores.json", {name: value.to_json() for name, value in reports.items()})
-    pages = write_run_report(out / "run", field, scene, method, command="kfgs demo")
-    segmented = [out / "segmentation" / name for name in ("predicted", "colored", "sheets")]
-    return [out / "run" / NAME, *segmented, *written, out / "surface.ply", *pages, *edited, out / "scores.json"]
+        written.append(write_comparison(out / f"{name}.png", before, after, views))
+    return written

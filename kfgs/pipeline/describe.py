@@ -34,8 +34,7 @@ def describe(path: str | Path) -> str:
     path = as_path(path)
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such file or folder; expected a field, a run, a scene or a splat file")
-    field = find_field(path)
-    if field is not None:
+    if (field := find_field(path)) is not None:
         return f"{SemanticField.load(field).summary()}\n  one file of {field.stat().st_size / 2**20:.2f} MiB"
     if path.is_file() or (splat_file_of(path) != path and not is_scene(path)):
         if is_cloud(splat_file_of(path)):

@@ -27,7 +27,6 @@ from ..formats import read_splats
 from ..gaussians import Gaussians
 from ..labels import LabelSet
 from ..scenes import FeatureFolder, Scene, load_scene
-from ..scenes.load import SplitChoice
 from ..scenes.scene import make_split
 from .maps import maps_of_views
 
@@ -74,7 +73,7 @@ def open_question(
     """
     protocol = get_protocol(protocol) if isinstance(protocol, str) else protocol
     folder, place = as_path(scene), None if truth is None else as_path(truth)
-    rule: SplitChoice = "auto" if split is not None else getattr(protocol, "scene_split", "auto")
+    rule: Any = "auto" if split is not None else getattr(protocol, "scene_split", "auto")
     loaded = load_scene(folder, images=images, split=rule).undistorted()
     if not isinstance(protocol, TeacherAgreement):
         return Question(protocol, loaded, *protocol.open(loaded, folder, place, split))

@@ -53,9 +53,8 @@ class Paper:
         if not isinstance(self.codebook, PaperCodebook | GrownCodebook | None):
             raise TypeError(f"codebook: expected PaperCodebook, GrownCodebook or None, got {self.codebook!r}; pass one")
         if self.codebook is None and self.autoencoder is not None:
-            raise ValueError(
-                "autoencoder: expected None with codebook=None, since it learns from codewords, got options; pass None for both"
-            )
+            expected = "None with codebook=None, since it learns from codewords"
+            raise ValueError(f"autoencoder: expected {expected}, got options; pass None for both")
 
     @staticmethod
     def paper(**changes: Any) -> Paper:

@@ -100,9 +100,8 @@ def write_run_report(
     repeat = command or f"kfgs.fit(scene, maps, method, folder={str(folder)!r})"
     options = html.escape(json.dumps(method.options(), indent=1))
     pictures = {file.stem: base64.b64encode(file.read_bytes()).decode("ascii") for file in written}
-    cells = (
-        f"<tr><td>{html.escape(name)}</td><td>{html.escape(str(value))}</td></tr>" for name, value in facts.items()
-    )
+    shown = {html.escape(name): html.escape(str(value)) for name, value in facts.items()}
+    cells = (f"<tr><td>{name}</td><td>{value}</td></tr>" for name, value in shown.items())
     parts = [
         f"<h1>kfgs: {title}</h1>",
         *(f'<h2>{name}</h2>\n<img alt="{name}" src="data:image/png;base64,{data}">' for name, data in pictures.items()),

@@ -70,8 +70,7 @@ def segment_scene(
     colors = FeatureColors.fit(field.latents) if pictures else None
     for k in evenly(len(views), pictures).tolist():
         stem, photo = scene.stem(views[k]), scene.image(views[k])
-        drawn = {"truth": truth[stem]} if stem in truth else {}
-        drawn["field"] = labels[stem]
+        drawn = ({"truth": truth[stem]} if stem in truth else {}) | {"field": labels[stem]}
         panels: dict[str, Any] = {"photograph": photo}
         for title, value in drawn.items():
             value = resize_labels(value, (photo.shape[0], photo.shape[1]))
