@@ -49,8 +49,7 @@ class GrownCodebook:
 
     def fit(self, read: Callable[[int], Tensor], maps: int, generator: torch.Generator, progress: Progress) -> Codebook:
         """See `fit_codebook`. `read` gives the sampled features [n, D] of a map, without all-zero ones."""
-        bar = tqdm(range(maps), desc="codebook", disable=progress is not True)
-        pool = torch.cat([unit_rows(read(i)) for i in bar])
+        pool = torch.cat([unit_rows(read(i)) for i in tqdm(range(maps), desc="codebook", disable=progress is not True)])
         if len(pool) == 0:
             raise all_zero(maps)
         centres, nearest, rounds = grow(pool, self.maximum, generator)
@@ -188,8 +187,7 @@ def grow(
         rounds.append((K + len(chosen), len(chosen), nearest.similarity))
         if len(chosen) == 0:
             return *refine(unit, centres, LAST_ROUNDS), rounds
-        centres = centres.clone()
-        centres[chosen] = halves[0, chosen]
+        centres = centres.index_copy(0, chosen, halves[0, chosen])
         centres, nearest = refine(unit, torch.cat([centres, halves[1, chosen]]), ROUNDS)
 
 
@@ -217,9 +215,8 @@ def _halves(
     across = along(direction)
     distance = _mean(1 - nearest.similarity[1::2], check_cell, K)
 
-    def split(
-        middle: Tensor,
-    ) -> tuple[Tensor, Tensor]:  # [K] -> [2, K, D], [K] halves on both sides of it, and the gain
+    def split(middle: Tensor) -> tuple[Tensor, Tensor]:  # [K] -> [2, K, D], [K]
+        """The halves on both sides of a middle, and the gain."""
         side = cell + K * (across > middle[cell])
         halves = unit_rows(group_sums(learn, side, 2 * K)).view(2, K, -1)
         to_halves = torch.stack([(check * half[check_cell]).sum(dim=1) for half in halves])  # [2, n / 2]

@@ -121,7 +121,10 @@ def farthest_points(features: Tensor, count: int) -> Tensor:  # [n, D], none all
 def farthest_first(unit: Tensor, similarity: Tensor, below: float, count: int) -> Tensor:  # [n, D], [n] -> [m] int64
     """The row of least similarity, then again after similarities are updated by it; at most `count`, each below the limit."""
     best, chosen = similarity.clone(), list[int]()
-    while len(chosen) < min(count, len(best)) and float(best[least := int(best.argmin())]) < below:
+    for _ in range(min(count, len(best))):
+        least = int(best.argmin())
+        if float(best[least]) >= below:
+            break
         chosen.append(least)
         best = torch.maximum(best, unit @ unit[least])
         best[least] = torch.inf  # present now, whatever rounding makes of its cosine with itself
