@@ -3,7 +3,7 @@ import torch
 from cases_clouds import balls
 from messages import refused
 
-from kfgs.cli.splats import Edits, parse_edits
+from kfgs.cli.edits import Edits, parse_edits
 from kfgs.labels import Extract, Move, OfClass, Recolor, Remove, connected_parts
 
 

@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Any, get_type_hints
 
 import tyro
+from tyro.conf import DisallowNone, FlagCreatePairsOff, OmitArgPrefixes, PositionalMetavarFromFieldName
 
 import kfgs
 
@@ -47,12 +48,7 @@ GROUPS: dict[str, tuple[Any, ...]] = {
 COMMANDS = {command.__name__: command for group in GROUPS.values() for command in group}
 RESUMED = {"demo", "features", "fit", "color", "batch"}  # commands that reuse their earlier work
 STRICT = "--strict"  # of every command that reads files
-STYLE = (
-    tyro.conf.DisallowNone,
-    tyro.conf.FlagCreatePairsOff,
-    tyro.conf.OmitArgPrefixes,
-    tyro.conf.PositionalMetavarFromFieldName,
-)
+STYLE = (DisallowNone, FlagCreatePairsOff, OmitArgPrefixes, PositionalMetavarFromFieldName)
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -151,10 +147,8 @@ def _overview() -> str:
 def _description(command: Callable[..., None]) -> str:
     """A command's docstring without the options. The indent keeps tyro from joining lines."""
     first, *more = (inspect.getdoc(command) or "").split("\n\nArgs:")[0].split("\n\n")
-    lines = [_wrap(first, "  ")]
-    for part in more:
-        lines.append("\n" + part if part.startswith("Examples:") else _wrap("  " + part, "  "))
-    return "\n".join(lines)
+    parts = ["\n" + part if part.startswith("Examples:") else _wrap("  " + part, "  ") for part in more]
+    return "\n".join([_wrap(first, "  "), *parts])
 
 
 def _wrap(text: str, indent: str = "") -> str:

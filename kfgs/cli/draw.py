@@ -122,8 +122,7 @@ def read_walk(path: Walk, frames: int | None) -> Callable[[Any, list[kfgs.Camera
             near = min((camera.near for camera in cameras), default=own[0].near)
             return [replace(camera, near=near) for camera in own]
         if path == "orbit":
-            size = (round(WIDTH * 3 / 4), WIDTH)
-            orbit = Orbit(frames=frames or FRAMES, size=size, elevation_degrees=45, zoom=1.5, cut=0.6)
+            orbit = Orbit(frames=frames or FRAMES, elevation_degrees=45, zoom=1.5, cut=0.6)
             return orbit_cameras(cloud.means, orbit, up=upwards(cameras), origin=cloud.origin)
         if not cameras:
             advice = "or take an orbit"

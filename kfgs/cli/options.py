@@ -15,8 +15,8 @@ from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 import docstring_parser
-import tyro
 from tyro.conf import Positional as Positional
+from tyro.conf import UseAppendAction, arg
 
 import kfgs
 
@@ -25,16 +25,15 @@ from .._notes import Repair
 from .files import say
 
 T = TypeVar("T")
-Given = Annotated[T | None, tyro.conf.arg(help_behavior_hint="")]  # None if the option is not given
-Flag = Annotated[bool, tyro.conf.arg(help_behavior_hint="")]
-Word = Annotated[str, tyro.conf.arg(metavar="NAME")]
-Name = Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="")]
-Several = Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="TEXT")]
+Given = Annotated[T | None, arg(help_behavior_hint="")]  # None if the option is not given
+Flag = Annotated[bool, arg(help_behavior_hint="")]
+Word = Annotated[str, arg(metavar="NAME")]
+Name = Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")]
+Several = Annotated[tuple[str, ...], UseAppendAction, arg(metavar="TEXT")]
 Walk = Literal["orbit", "cameras"] | Path  # paths of cameras
 Setting = tuple[list[type], str, str]  # an option for --set: the types of its values, its value as written, its text
 KINDS = {int, float, bool, str, tuple, NoneType}  # of such values
-SCENE_HELP = "Folder with images and a COLMAP model or transforms.json."
-SceneFolder = Annotated[Path, Positional, tyro.conf.arg(help=SCENE_HELP)]
+SceneFolder = Annotated[Path, Positional, arg(help="Folder with images and a COLMAP model or transforms.json.")]
 
 
 @dataclass(frozen=True)
@@ -43,7 +42,7 @@ class Settings:
 
     steps: Given[int] = None
     """Training steps, by default those of the method or preset; the schedule is stretched (not by --set training.steps=N)."""
-    set: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="NAME=VALUE")] = ()
+    set: Annotated[tuple[str, ...], UseAppendAction, arg(metavar="NAME=VALUE")] = ()
     """Any other option of the method, as in "codebook.maximum=50" or "uplift.max_gaussians=none". May be given several times;
     --set help lists all of them."""
 
