@@ -85,4 +85,4 @@ def test_columns_of_text_are_refused(ending, tmp_path):
 
 
 def test_a_file_that_cannot_be_read_is_named(tmp_path):
-    refused(lambda: read_splats("/proc/self/mem"), "/proc/self/mem", "splat file that can be read", error=OSError)
+    refused(lambda: read_splats("/proc/self/mem"), "/proc/self/mem: expected a splat file, but it cannot be read")
