@@ -25,7 +25,8 @@ _OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "no_cfunc_wra
 def inner_njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """`numba.njit` for functions that only kernels call.
 
-    A call from Python ends the process: what numba compiles for such a call holds one more copy of the function, and of all that it inlines.
+    A call from Python ends the process: what numba compiles for such a call would be one more copy of the function, and of
+    all that it inlines.
     """
     return njit(no_cpython_wrapper=True, **_OPTIONS, **options)  # type: ignore[no-any-return]
 
