@@ -32,8 +32,8 @@ from .square import (
     Rows,
     View,
     aligned,
+    find_place,
     make_square,
-    squares_of,
     start_square,
 )
 
@@ -107,7 +107,8 @@ def composite_band(
         pixels = aligned(LANES * LANES, rows.values)
     if source is not None:
         sums, kept = aligned(PIXELS * stride, rows.values), wide.make_kept(rows.values)
-    for place in squares_of(view, band):
+    for number in range(view.bounds[band] * view.across**2, view.bounds[band + 1] * view.across**2):
+        place = find_place(view, number)
         dark = start_square(square, place.box)
         span = place.start, place.end, place.trace
         if passes is not None:
@@ -123,7 +124,7 @@ def composite_band(
                     write_block(picture, place.box, block, channel, pixels, 0, LANES)
         if source is not None:
             done, filled = wide.composite_square(rows, span, square, dark, source, sums, kept, trace.drawn)
-        trace.seen[place.number] = done - place.start
+        trace.seen[number] = done - place.start
         left, top, right, bottom = place.box
         for y in range(bottom - top):
             for x in range(right - left):
@@ -161,7 +162,8 @@ def accumulate_band(
     scratch = aligned(LANES * LANES, rows.values)
     own = out[firsts[band] * width : firsts[band + 1] * width]
     own[:] = 0
-    for place in squares_of(view, band):
+    for number in range(view.bounds[band] * view.across**2, view.bounds[band + 1] * view.across**2):
+        place = find_place(view, number)
         if place.start == place.end:
             continue
         dark = start_square(square, place.box)

@@ -17,8 +17,8 @@ from .square import (
     Rows,
     View,
     aligned,
+    find_place,
     make_square,
-    squares_of,
     start_square,
 )
 
@@ -102,8 +102,9 @@ def differentiate_band(
         slopes, kept = aligned((CHUNK + 3) * LANES, rows.values), wide.make_kept(rows.values)
     own = out[firsts[band] * row : firsts[band + 1] * row]
     own[:] = 0
-    for place in squares_of(view, band):
-        seen = trace.seen[place.number]
+    for number in range(view.bounds[band] * view.across**2, view.bounds[band + 1] * view.across**2):
+        place = find_place(view, number)
+        seen = trace.seen[number]
         if seen == 0:
             continue
         start_square(square, place.box)

@@ -17,8 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from . import narrow as narrow
-from . import wide as wide
+from . import narrow, wide
 from .bands import SIXTEEN
 from .cache import cached_njit, inner_njit
 from .simd import LANES, fetch, load, load_many, put, select, spread, store, store_many, transpose
@@ -31,8 +30,8 @@ from .square import (
     Rows,
     View,
     aligned,
+    find_place,
     make_square,
-    squares_of,
     start_square,
 )
 
@@ -155,7 +154,8 @@ def rank_band(
     if source is not None:
         sums, planes = aligned(PIXELS * stride, rows.values), aligned(stride * LANES, rows.values)
         kept = wide.make_kept(rows.values)
-    for place in squares_of(view, band):
+    for number in range(view.bounds[band] * view.across**2, view.bounds[band + 1] * view.across**2):
+        place = find_place(view, number)
         dark = start_square(square, place.box)
         span, count, names = (place.start, place.end, place.start), channels, every
         if passes is not None:

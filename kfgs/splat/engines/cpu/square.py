@@ -11,7 +11,6 @@ a (dx + (b / a) dy)^2 + (c - b^2 / a) dy^2: both terms are positive, so that nee
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -154,7 +153,6 @@ class Square(NamedTuple):
 class Place(NamedTuple):
     """Where a square lies in the image and in the lists."""
 
-    number: int  # of all squares
     box: tuple[int, int, int, int]  # left, top, right and bottom pixel, cut off at the tile's and the image's border
     start: int  # its Gaussians are order[start:end]
     end: int
@@ -162,19 +160,17 @@ class Place(NamedTuple):
 
 
 @inner_njit()
-def squares_of(view: View, band: int) -> Iterator[Place]:
-    """The squares of a band's tiles, front to back."""
+def find_place(view: View, number: int) -> Place:
+    """Where a square lies; beyond a border it has neither pixels nor Gaussians. Numba frees nothing that a generator is given."""
+    tile, square = number // view.across**2, number % view.across**2
     columns = (view.width + view.tile_size - 1) // view.tile_size
-    for tile in range(view.bounds[band], view.bounds[band + 1]):
-        start, end = view.offsets[tile], view.offsets[tile + 1]
-        tile_x, tile_y = tile % columns * view.tile_size, tile // columns * view.tile_size
-        for square in range(view.across**2):
-            left, top = tile_x + square % view.across * SQUARE_SIDE, tile_y + square // view.across * SQUARE_SIDE
-            right = min(left + SQUARE_SIDE, tile_x + view.tile_size, view.width)
-            bottom = min(top + SQUARE_SIDE, tile_y + view.tile_size, view.height)
-            if left < right and top < bottom:
-                trace = start * view.across**2 + square * (end - start)
-                yield Place(tile * view.across**2 + square, (left, top, right, bottom), start, end, trace)
+    start, end = view.offsets[tile], view.offsets[tile + 1]
+    tile_x, tile_y = tile % columns * view.tile_size, tile // columns * view.tile_size
+    left, top = tile_x + square % view.across * SQUARE_SIDE, tile_y + square // view.across * SQUARE_SIDE
+    right = min(left + SQUARE_SIDE, tile_x + view.tile_size, view.width)
+    bottom = min(top + SQUARE_SIDE, tile_y + view.tile_size, view.height)
+    trace = start * view.across**2 + square * (end - start)
+    return Place((left, top, right, bottom), start, end if left < right and top < bottom else start, trace)
 
 
 @inner_njit(forceinline=True)
