@@ -4,7 +4,6 @@ import json
 import subprocess
 import sys
 import time
-import warnings
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -12,7 +11,6 @@ import pytest
 import torch
 from cases_splat import random_splats
 from forked import forks, in_fork
-from torch.utils.data import DataLoader
 
 numba = pytest.importorskip("numba")
 
@@ -292,25 +290,6 @@ def test_a_forked_child_does_all_that_its_parent_does(two_threads):
 
     assert in_fork(work) == [True] * 5
     assert torch.equal(_frame(), expected)
-
-
-class _Frames(torch.utils.data.Dataset):
-    def __len__(self):
-        return 4
-
-    def __getitem__(self, i):
-        return _frame(i)
-
-
-@forks
-def test_workers_of_a_data_loader_composite_too(two_threads):
-    expected = [_frame(i) for i in range(4)]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)
-        loader = DataLoader(_Frames(), batch_size=None, num_workers=2, multiprocessing_context="fork", timeout=300)
-        frames = list(loader)
-    for frame, truth in zip(frames, expected, strict=True):
-        assert torch.equal(frame, truth)
 
 
 WARM = """
