@@ -1,15 +1,18 @@
 """What to run on a day when a GPU is lent: right kernels first, then speed beside gsplat, then the main job.
 
-    python benchmarks/gpu.py --out FOLDER --scene TOY [--parts kernels speed job] [--minutes 4]
+    bash benchmarks/gpu.sh OUT [--scene TOY]         all of it, in at most 8 minutes
+    python benchmarks/gpu.py --out OUT --parts speed
 
-Kernels: every case of `tests/cases_triton.py` against the reference engine in float64, shared out to processes. Speed:
-`engines.py --device cuda` for at most `--minutes` (gsplat is compiled at first use; install it before, or it is left out).
-The main job: colours of a toy room, and fields by the default method and by the paper's, scored on unseen views. All that is
-found goes to gpu.json, and a line of it to the screen. The job is timed alone: run its parts one after the other.
+Kernels: every case of `tests/cases_triton.py` against the reference engine in float64, forward and backward, shared out to
+processes. Speed: a step, a frame, the best classes of each pixel, and uplift at 3, 9, 24, 64 and 512 channels, beside gsplat
+where `import gsplat` works (it is compiled at first use; install it before); `engines.py --device cuda` measures more. The main
+job: colours of a toy room, and fields by the default method and by the paper's, scored on unseen views. After each result
+OUT/gpu.json has all numbers and OUT/gpu.md a table, those of earlier calls with the same OUT too: a part that is stopped
+loses only what it was about. The job is timed alone: run the parts one after the other.
 
-TOY is the room of `kfgs demo` (`DEMO/scene`), made where pycolmap is. To carry less, leave out its folder `features`: they are
-made again, the same. `CUDA_VISIBLE_DEVICES="" ... --parts job` gives the CPU's numbers for the same room. Without a GPU,
-`TRITON_INTERPRET=1 python benchmarks/gpu.py --parts kernels --cases "3 channels"` tries the script itself.
+TOY is the room of `kfgs demo` (`DEMO/scene`). It is made if it is not given, which needs pycolmap. To carry less, leave out its
+folder `features`: they are made again, the same. `CUDA_VISIBLE_DEVICES="" ... --parts job` gives the CPU's numbers for the same
+room. Without a GPU, `TRITON_INTERPRET=1 bash benchmarks/gpu.sh OUT --toy` tries the script itself; its numbers mean nothing.
 """
 
 from __future__ import annotations
@@ -22,6 +25,7 @@ import sys
 import time
 import zlib
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -34,15 +38,25 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tests"))
 
 import cases_triton  # noqa: E402
+from engines import CHANNELS  # noqa: E402
+from engines_machine import measure  # noqa: E402
+from engines_runners import Case, calls, engine_names, missing, prepare  # noqa: E402
 
 from kfgs.evaluation import score_views  # noqa: E402
 from kfgs.pipeline import ColorConfig, Paper, Uplift, fit, fit_color  # noqa: E402
 from kfgs.pipeline.segment import score_scene, segment_scene, true_labels  # noqa: E402
 from kfgs.scenes import FeatureFolder, load_scene  # noqa: E402
+from kfgs.toy.room_folder import ToyConfig, make_toy_room  # noqa: E402
 from kfgs.toy.teacher import teacher_features  # noqa: E402
 
 SHARES = 6  # processes: each compiles kernels for most of its time
 PARTS = "kernels", "speed", "job"
+TIMED = "step", "frame", "labels", "uplift"
+CASES = [Case(110_000, channels, 480, 360) for channels in CHANNELS]
+TOY_CASES, TOY_CHECKS = [Case(20, 24, 16, 8)], ["one channel"]
+TOY_ROOM = ToyConfig(
+    train_views=8, test_views=2, size=(48, 64), feature_size=(18, 24), surface_points=2_000, sparse_points=800
+)
 METHODS = {
     "uplift": Uplift,
     "grown": Paper.grown,
@@ -56,36 +70,65 @@ def main() -> None:
     """Run the parts; each writes what it finds before the next begins."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, default=Path("gpu_benchmark"))
-    parser.add_argument("--scene", type=Path, help="a toy room, for the job")
+    parser.add_argument("--scene", type=Path, help="a toy room, for the job (default: it is made)")
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS)
-    parser.add_argument("--minutes", type=float, default=4.0, help="most minutes for the speeds")
-    parser.add_argument("--cases", nargs="+", help="kernels' cases to run in this process, instead of all in several")
+    parser.add_argument("--toy", action="store_true", help="a case, and sizes, that prove that the script runs")
     parser.add_argument("--methods", nargs="+", choices=METHODS, default=METHODS, help="of the job")
     args = parser.parse_args()
-    if "job" in args.parts and args.scene is None:
-        parser.error(
-            "--scene: expected a toy room for the job, got none; make one with `kfgs demo`, or leave out the job"
-        )
     args.out.mkdir(parents=True, exist_ok=True)
     device = "cuda" if torch.cuda.is_available() else "cpu"
-    report: dict[str, Any] = {"device": torch.cuda.get_device_name() if device == "cuda" else "cpu"}
+    file = args.out / "gpu.json"
+    report: dict[str, Any] = json.loads(file.read_text()) if file.exists() else {}
+    report["device"] = torch.cuda.get_device_name() if device == "cuda" else "cpu"
 
-    def save(part: str, found: Any) -> None:
-        report[part] = found
-        (args.out / "gpu.json").write_text(json.dumps(report, indent=1))
-        print(f"{part}: {json.dumps(found)}", flush=True)
+    def save(part: str, facts: Any) -> None:
+        report[part] = facts
+        file.write_text(json.dumps(report, indent=1))
+        (args.out / "gpu.md").write_text(write_table(report))
+        print(f"{part}: {json.dumps(facts)}", flush=True)
 
     if "kernels" in args.parts:
-        save("kernels", check_kernels(device, args.cases))
+        save("kernels", check_kernels(device, TOY_CHECKS if args.toy else None))
     if "speed" in args.parts:
-        command = [sys.executable, str(ROOT / "benchmarks/engines.py"), "--device", device, "--repeats", "7"]
-        command += ["--out", str(args.out)]
-        try:
-            subprocess.run(command, timeout=60 * args.minutes, check=False)
-        except subprocess.TimeoutExpired:
-            print("speed: out of time; engines.md has what was measured")
+        time_engines(torch.device(device), args.toy, save)
     if "job" in args.parts:
-        do_main_job(args.scene, args.out, device, args.methods, save)
+        scene = args.scene or make_toy_room(args.out / "scene", TOY_ROOM if args.toy else ToyConfig())
+        do_main_job(scene, args.out, device, args.methods, args.toy, save)
+
+
+def time_engines(device: torch.device, toy: bool, save: Callable[[str, Any], None]) -> None:
+    """Seconds of `TIMED` by engine and case; kfgs's GPU engine runs on the CPU in Triton's interpreter."""
+    engines = engine_names(device) if device.type == "cuda" else ["kfgs triton"]
+    seconds: dict[str, dict[str, dict[str, float]]] = {}
+    for absent in missing(device):
+        print(f"left out: {absent}")
+    for case in TOY_CASES if toy else CASES:
+        inputs = prepare(case, device)
+        jobs = {
+            (engine, name): call for engine in engines for name, call in calls(engine, inputs).items() if name in TIMED
+        }
+        for (engine, name), times in measure(jobs, 1 if toy else 9).items():
+            seconds.setdefault(str(case), {}).setdefault(engine, {})[name] = times.median
+        save("speed", seconds)
+
+
+def write_table(report: dict[str, Any]) -> str:
+    """What is known so far, in Markdown."""
+    lines = [f"**{report['device']}**", ""]
+    if "kernels" in report:
+        kernels = report["kernels"]
+        lines += [f"Kernels: {kernels['cases']} cases, wrong: {', '.join(kernels['faults']) or 'none'}.", ""]
+    if "speed" in report:
+        lines += ["| milliseconds | " + " | ".join(("engine", *TIMED)) + " |", "|---|---|" + "---|" * len(TIMED)]
+        for case, engines in report["speed"].items():
+            for engine, seconds in engines.items():
+                cells = (f"{1e3 * seconds[name]:.2f}" if name in seconds else "-" for name in TIMED)
+                lines.append(f"| {case} | {engine} | {' | '.join(cells)} |")
+        lines.append("")
+    jobs = {name: report[name] for name in ("colours", *METHODS) if name in report}
+    lines += ["| job | seconds | Gaussians | score |", "|---|---|---|---|"] if jobs else []
+    lines += [f"| {name} | {job['seconds']} | {job['Gaussians']:,} | {job['score']} |" for name, job in jobs.items()]
+    return "\n".join(lines) + "\n"
 
 
 def check_kernels(device: str, cases: list[str] | None) -> dict[str, Any]:
@@ -111,11 +154,16 @@ def check_kernels(device: str, cases: list[str] | None) -> dict[str, Any]:
     return {"cases": len(facts), "faults": {name: wrong for name, wrong in faults.items() if wrong}}
 
 
-def do_main_job(folder: Path, out: Path, device: str, methods: Iterable[str], save: Callable[[str, Any], None]) -> None:
+def do_main_job(
+    folder: Path, out: Path, device: str, methods: Iterable[str], toy: bool, save: Callable[[str, Any], None]
+) -> None:
     """Seconds and scores of colours and of a field by each method, and how many labels of a view are equal on the CPU."""
     scene, maps = load_scene(folder), FeatureFolder(make_features(folder))
     truth, start = true_labels(scene, folder / "labels", "test"), time.perf_counter()
-    colors = fit_color(scene, out / "run", ColorConfig.quick())
+    options = ColorConfig.quick()
+    if toy:
+        options = replace(options, training=replace(options.training, steps=20))
+    colors = fit_color(scene, out / "run", options)
     seconds = round(time.perf_counter() - start, 1)
     save("colours", {"seconds": seconds, "score": str(score_views(colors, scene)), "Gaussians": len(colors)})
     for name in methods:
