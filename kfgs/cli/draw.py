@@ -260,7 +260,7 @@ def evaluate(
 
     Args:
         field: A run or field, or a folder of a teacher's maps; for kfgs-color a colour splat, or a run that has one.
-        protocol: Its name, with or without version; a wrong name lists all.
+        protocol: Its name, with or without version; a wrong name lists all. df3dgs scores the test views of the paper's split.
         truth: Folder or file of the ground truth, if it is not in the scene; the teacher's maps for feature3dgs-teacher.
         labels: Who says the class of a pixel: the field itself (own), Sec. 3.4 (paper), or the nearest text, as for others.
         out: JSON file of scores, rows, options, command and machine.
