@@ -27,13 +27,14 @@ from kfgs import Camera
 from kfgs.fields import Autoencoded, Linear, SemanticField
 from kfgs.labels import classify
 from kfgs.labels.classify import pixel_codewords
-from kfgs.labels.scores import LOGIT_SCALE
+from kfgs.labels.scores import LOGIT_SCALE, TEMPERATURE
 from kfgs.labels.selection import select_by_similarity
 from kfgs.quant import Autoencoder, Codebook
 from kfgs.scenes import load_scene
 from kfgs.splat import bin_tiles, project, rasterize, rasterize_labels
 
 DIM, LINEAR, LATENTS, CODEWORDS = 512, 24, 9, 100
+BATCH = 16  # texts that are asked at once
 DECODER = 9, 32, 64, 128, 256, 1024, 512  # Sec. 4 of the paper
 CHUNK = 8192
 
@@ -164,6 +165,13 @@ def compare(field: SemanticField, camera: Camera, rows: Tensor, repeats: int) ->
                 "blended scores, not scores of blended features",
             ),
             measure(
+                f"{BATCH} text queries of a view, one by one and at once",
+                lambda: torch.stack([scored(field, camera, text, rows[1:5]) for text in many[:BATCH, 0]]),
+                lambda: scored_at_once(field, camera, many[:BATCH, 0], rows[1:5]),
+                max(2, repeats // 5),
+                "to 3e-7",
+            ),
+            measure(
                 "5 best classes",
                 lambda: blended(field, camera, rows, 5),
                 lambda: field.rank(camera, rows, top=5).labels,
@@ -220,6 +228,16 @@ def scored(field: SemanticField, camera: Camera, text: Tensor, negatives: Tensor
     scores = field.query(text, None, 0.0, negatives=negatives).scores
     shown = rasterize_labels(field.gaussians.replace(features=scores[:, None].contiguous(), sh=None), camera)
     return shown.scores[..., 0] / shown.alphas.clamp_min(1e-6)
+
+
+def scored_at_once(field: SemanticField, camera: Camera, texts: Tensor, negatives: Tensor) -> Tensor:  # [Q, H, W]
+    """`scored` for Q texts: their scores are the channels of one picture, so a view is projected and composited once."""
+    cosines = field.cosines(torch.cat([texts, negatives]))
+    against = cosines[:, len(texts) :].amax(dim=1, keepdim=True)
+    scores = torch.sigmoid(TEMPERATURE * (cosines[:, : len(texts)] - against)) * field.known[:, None]
+    with torch.no_grad():
+        shown = rasterize(field.gaussians.replace(features=scores, sh=None), camera)
+    return (shown.map / shown.alpha[..., None].clamp_min(1e-6)).permute(2, 0, 1)
 
 
 def similar(field: SemanticField, camera: Camera, rows: Tensor) -> Tensor:
