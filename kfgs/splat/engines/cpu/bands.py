@@ -157,9 +157,8 @@ def accumulate_band(
     """Sum one band's pixels into its own rows of `out`, weighted: the weights' sum follows the channels."""
     width = wide.padded_length(channels + 1)
     picture, square = Picture(pixels, view.width, channels), make_square(rows.values)
-    planes, weights = aligned(width * PIXELS, rows.values), aligned(PIXELS, rows.values)
-    planes[:] = 0
-    scratch = aligned(LANES * LANES, rows.values)
+    values, kept = aligned(PIXELS * width, rows.values), wide.make_kept(rows.values)
+    values[:] = 0
     own = out[firsts[band] * width : firsts[band + 1] * width]
     own[:] = 0
     for number in range(view.bounds[band] * view.across**2, view.bounds[band + 1] * view.across**2):
@@ -169,8 +168,6 @@ def accumulate_band(
         dark = start_square(square, place.box)
         for block in range(BLOCKS):
             for channel in range(0, channels, LANES):
-                read_block(picture, place.box, block, channel, scratch, 0, LANES)
-                values = transpose(load_many(SIXTEEN, scratch, 0, LANES))
-                store_many(planes, channel * PIXELS + block * LANES, PIXELS, values)
-        planes[channels * PIXELS : (channels + 1) * PIXELS] = 1
-        narrow.accumulate_square(rows, (place.start, place.end), square, dark, planes, weights, slots, width, own)
+                read_block(picture, place.box, block, channel, values, block * LANES * width + channel, width)
+        values[channels::width] = 1
+        wide.accumulate_square(rows, (place.start, place.end), square, dark, values, kept, slots, width, own)

@@ -50,7 +50,6 @@ from .square import (
     X,
     Y,
     list_hits,
-    touched_blocks,
     weigh_pixels,
 )
 
@@ -290,43 +289,3 @@ def _sum_group(weights: Any, planes: Any, start: int, touched: Any) -> Any:
         touched &= touched - np.uint32(1)
         total = add_outer(total, (load(weights, p),), load_many(GROUP, planes, start + p, PIXELS))
     return sum_many(total)
-
-
-@inner_njit(forceinline=True)
-def accumulate_square(
-    rows: Rows,
-    span: tuple[int, int],  # where the square's list begins and ends
-    square: Square,
-    dark: Any,  # bits of blocks without pixels
-    planes: Any,  # what is summed: a multiple of LANES planes
-    weights: Any,  # [PIXELS], scratch
-    slots: Any,  # the row of `out` of each place in the list
-    width: int,  # of a row of `out`, as many numbers as there are planes
-    out: Any,  # added to
-) -> None:
-    """Add weights times planes to the rows of one square's Gaussians (`Engine.accumulate`)."""
-    values, length, order = rows
-    state = square.state
-    epsilon = values.dtype.type(np.finfo(values.dtype).eps)
-    for j in range(span[0], span[1]):
-        if dark == ALL_BLOCKS:
-            break
-        prefetch(values, np.int64(fetch(order, min(j + PREFETCH_AHEAD, span[1] - 1))) * length)
-        at = np.int64(fetch(order, j)) * length
-        touched = touched_blocks(values, at, square.corners, epsilon) & ~dark
-        remaining = touched
-        while remaining:
-            block = trailing_zeros(remaining)
-            p = block * LANES
-            remaining &= remaining - np.uint32(1)
-            _, _, _, alpha = weigh_pixels(values, at, load(state, X + p), load(state, Y + p))
-            light = load(state, LIGHT + p)
-            light_behind = light * (1 - alpha)
-            drawn = light_behind >= TRANSMITTANCE_MIN
-            store(state, LIGHT + p, light_behind)
-            store(weights, p, select(drawn, alpha * light, 0))
-            if not any_of(drawn):
-                dark |= np.uint32(1) << np.uint32(block)
-        for channel in range(0, width, LANES):
-            place = np.int64(fetch(slots, j)) * width + channel
-            store(out, place, load(out, place) + _sum_group(weights, planes, channel * PIXELS, touched))

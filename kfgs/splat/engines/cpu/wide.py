@@ -86,8 +86,10 @@ def make_kept(like: Any) -> Kept:
 
 
 @inner_njit(forceinline=True)
-def weigh_block(rows: Rows, block: int, square: Square, begins: Any, kept: Kept) -> tuple[int, bool]:
+def weigh_block(rows: Rows, block: int, square: Square, begins: Any, kept: Kept, ratios: Any) -> tuple[int, bool]:
     """Composite the listed Gaussians into a block's transmittance, keeping those that are drawn.
+
+    Without `begins` or `ratios` (None), the part of `kept` that takes them is not written.
 
     Returns:
         How many Gaussians are drawn, and whether some pixel has not stopped.
@@ -107,9 +109,11 @@ def weigh_block(rows: Rows, block: int, square: Square, begins: Any, kept: Kept)
         weight = select(drawn, weight, 0)
         final = select(drawn, light, final)
         store(kept.weights, drawn_count * LANES, weight)
-        store(kept.ratios, drawn_count * LANES, select(drawn & (full <= ALPHA_MAX), alpha * reciprocal(clear), 0))
         put(kept.places, drawn_count, j)
-        put(kept.begins, drawn_count, fetch(begins, number))
+        if ratios is not None:
+            store(ratios, drawn_count * LANES, select(drawn & (full <= ALPHA_MAX), alpha * reciprocal(clear), 0))
+        if begins is not None:
+            put(kept.begins, drawn_count, fetch(begins, number))
         if any_of(weight > 0):
             drawn_count += 1
     store(state, LIGHT + p, light)
@@ -158,7 +162,7 @@ def composite_square(
         for block in range(BLOCKS):
             if counts[block]:
                 bit = np.uint32(1) << np.uint32(block)
-                count, lit = weigh_block(rows, block, square, source.begins, kept)
+                count, lit = weigh_block(rows, block, square, source.begins, kept, None)
                 add_colors(sums, block * LANES * stride, stride, kept, source, count, (filled & bit) == 0)
                 filled |= bit
                 if not lit:
@@ -199,7 +203,7 @@ def differentiate_square(
         for block in range(BLOCKS):
             if counts[block] == 0:
                 continue
-            count, _ = weigh_block(rows, block, square, source.begins, kept)
+            count, _ = weigh_block(rows, block, square, source.begins, kept, kept.ratios)
             corner = block * LANES * stride
             if geometry:
                 multiply_features(slopes, source, kept.begins, grads, corner, stride, count)
@@ -287,10 +291,36 @@ def add_moments(
 def add_features(
     out: Any, width: int, slots: Any, kept: Kept, grads: Any, corner: int, stride: int, count: int
 ) -> None:
-    """out[k, c] += weights[k, pixel] grads[pixel, c], summed over a block's 16 pixels."""
+    """out[k, c] += weights[k, pixel] grads[pixel, c], summed over a block's 16 pixels; a row of `out` ends in the channels."""
     for channel in range(0, stride, LANES):
         pixels = load_many(SIXTEEN, grads, corner + channel, stride)
         for k in range(count):
-            place = np.int64(fetch(slots, np.int64(fetch(kept.places, k)))) * width + LANES + channel
+            place = (np.int64(fetch(slots, np.int64(fetch(kept.places, k)))) + 1) * width - stride + channel
             total = add_dot(spread(out, 0), spread_many(SIXTEEN, kept.weights, k * LANES, 1), pixels)
             store(out, place, load(out, place) + total)
+
+
+@inner_njit(forceinline=True)
+def accumulate_square(
+    rows: Rows,
+    span: tuple[int, int],  # where the square's list begins and ends
+    square: Square,
+    dark: Any,  # bits of blocks without pixels
+    pixels: Any,  # [PIXELS, width] what is summed, in the order of blocks
+    kept: Kept,
+    slots: Any,  # the row of `out` of each place in the list
+    width: int,  # of a row of `out`
+    out: Any,  # added to
+) -> None:
+    """Add weights times pixels to the rows of one square's Gaussians (`Engine.accumulate`)."""
+    position, end = span
+    while position < end and dark != ALL_BLOCKS:
+        stop = min(position + CHUNK, end)
+        list_hits(rows, (position, stop), dark, square, None, 0)
+        for block in range(BLOCKS):
+            if square.counts[block]:
+                count, lit = weigh_block(rows, block, square, None, kept, None)
+                add_features(out, width, slots, kept, pixels, block * LANES * width, width, count)
+                if not lit:
+                    dark |= np.uint32(1) << np.uint32(block)
+        position = stop
