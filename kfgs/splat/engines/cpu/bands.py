@@ -21,6 +21,7 @@ from .simd import (
     store,
     store_many,
     store_part,
+    stream,
     transpose,
 )
 from .square import (
@@ -107,6 +108,7 @@ def composite_band(
         pixels = aligned(LANES * LANES, rows.values)
     if source is not None:
         sums, kept = aligned(PIXELS * stride, rows.values), wide.make_kept(rows.values)
+        streams = channels == stride and maps.ctypes.data % 64 == 0  # a pixel's row is whole cache lines
     for number in range(view.bounds[band] * view.across**2, view.bounds[band + 1] * view.across**2):
         place = find_place(view, number)
         dark = start_square(square, place.box)
@@ -139,8 +141,11 @@ def composite_band(
                         value = load(background, channel) * final
                         if summed:
                             value = value + load(sums, p * stride + channel)
-                        lanes = lanes_below(maps, channels - channel)
-                        store_part(maps, pixel * channels + channel, lanes, value)
+                        if streams:
+                            stream(maps, pixel * channels + channel, value)
+                        else:
+                            lanes = lanes_below(maps, channels - channel)
+                            store_part(maps, pixel * channels + channel, lanes, value)
 
 
 @cached_njit()

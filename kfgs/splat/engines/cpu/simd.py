@@ -256,6 +256,14 @@ def store_part(context: Any, builder: Any, kinds: Any, array: Any, index: Any, m
     _call(builder, f"llvm.masked.store.{_suffix(kinds[0].dtype)}.p0", ir.VoidType(), vector, place, size, mask)
 
 
+@_operation(types.void)
+def stream(context: Any, builder: Any, kinds: Any, array: Any, index: Any, vector: Any) -> None:
+    """Write a vector to whole cache lines that are not needed soon: they are neither read before, nor kept in the cache."""
+    place = builder.bitcast(_pointer(context, builder, kinds[0], array, index), vector.type.as_pointer())
+    hint = builder.module.add_metadata([ir.Constant(_I32, 1)])
+    builder.store(vector, place, align=64).set_metadata("nontemporal", hint)
+
+
 @_operation(lambda array, index: array.dtype)
 def fetch(context: Any, builder: Any, kinds: Any, array: Any, index: Any) -> Any:
     """array[index], without looking whether the index is negative."""
