@@ -20,11 +20,12 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import shutil
 import subprocess
 import sys
 import time
 import zlib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -42,6 +43,7 @@ from engines import CHANNELS  # noqa: E402
 from engines_machine import measure  # noqa: E402
 from engines_runners import Case, calls, engine_names, missing, prepare  # noqa: E402
 
+from kfgs._files import read_json, write_json  # noqa: E402
 from kfgs.evaluation import score_views  # noqa: E402
 from kfgs.pipeline import ColorConfig, Paper, Uplift, fit, fit_color  # noqa: E402
 from kfgs.pipeline.segment import score_scene, segment_scene, true_labels  # noqa: E402
@@ -77,23 +79,27 @@ def main() -> None:
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
     device = "cuda" if torch.cuda.is_available() else "cpu"
+    name = (torch.cuda.get_device_name() if device == "cuda" else "cpu") + (", toy sizes" if args.toy else "")
     file = args.out / "gpu.json"
-    report: dict[str, Any] = json.loads(file.read_text()) if file.exists() else {}
-    report["device"] = torch.cuda.get_device_name() if device == "cuda" else "cpu"
+    report: dict[str, Any] = dict(read_json(file)) if file.exists() else {}
+    report = report if report.get("device") == name else {"device": name}  # never two devices in one table
 
     def save(part: str, facts: Any) -> None:
         report[part] = facts
-        file.write_text(json.dumps(report, indent=1))
+        write_json(file, report)
         (args.out / "gpu.md").write_text(write_table(report))
         print(f"{part}: {json.dumps(facts)}", flush=True)
 
     if "kernels" in args.parts:
-        save("kernels", check_kernels(device, TOY_CHECKS if args.toy else None))
+        for facts in check_kernels(device, TOY_CHECKS if args.toy else None):
+            save("kernels", facts)
     if "speed" in args.parts:
         time_engines(torch.device(device), args.toy, save)
     if "job" in args.parts:
         scene = args.scene or make_toy_room(args.out / "scene", TOY_ROOM if args.toy else ToyConfig())
         do_main_job(scene, args.out, device, args.methods, args.toy, save)
+    if report.get("kernels", {}).get("faults"):
+        raise SystemExit(1)
 
 
 def time_engines(device: torch.device, toy: bool, save: Callable[[str, Any], None]) -> None:
@@ -131,27 +137,31 @@ def write_table(report: dict[str, Any]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def check_kernels(device: str, cases: list[str] | None) -> dict[str, Any]:
-    """How many cases were run, and what is wrong with those that failed."""
-    if cases:
-        facts = {name: cases_triton.run_case(cases_triton.CASES[name], device) for name in cases}
-    else:
-        script = str(ROOT / "tests/cases_triton.py")
-        environment = os.environ | {"PYTHONPATH": f"{ROOT}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"}
-        running = [
-            subprocess.Popen(
-                [sys.executable, script, "run", device, f"{k}/{SHARES}"],
-                stdout=subprocess.PIPE,
-                text=True,
-                env=environment,
-            )
-            for k in range(SHARES)
-        ]
-        facts = {}
-        for process in running:
-            facts |= json.loads(process.communicate()[0])
-    faults = {name: cases_triton.find_faults(name, found) for name, found in facts.items()}
-    return {"cases": len(facts), "faults": {name: wrong for name, wrong in faults.items() if wrong}}
+def check_kernels(device: str, cases: list[str] | None) -> Iterator[dict[str, Any]]:
+    """How many cases were run so far, and what is wrong with those that failed, after each process."""
+    facts: dict[str, Any] = {}
+    faults: dict[str, Any] = {}
+    for k, found in enumerate([run_cases(device, cases)] if cases else run_shares(device)):
+        facts |= found or {}
+        faults |= {name: wrong for name in found or {} if (wrong := cases_triton.find_faults(name, facts[name]))}
+        faults |= {} if found is not None else {f"process {k} of {SHARES}": "ended without a result"}
+        yield {"cases": len(facts), "faults": faults}
+
+
+def run_cases(device: str, cases: list[str]) -> dict[str, Any]:
+    """What some cases gave, in this process."""
+    return {name: cases_triton.run_case(cases_triton.CASES[name], device) for name in cases}
+
+
+def run_shares(device: str) -> Iterator[dict[str, Any] | None]:
+    """What each process gave for its share of all cases; None if it ended without a result."""
+    command = [sys.executable, str(ROOT / "tests/cases_triton.py"), "run", device]
+    environment = os.environ | {"PYTHONPATH": f"{ROOT}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"}
+    options: dict[str, Any] = {"stdout": subprocess.PIPE, "text": True, "env": environment}
+    running = [subprocess.Popen([*command, f"{k}/{SHARES}"], **options) for k in range(SHARES)]
+    for process in running:
+        text = process.communicate()[0]
+        yield json.loads(text) if process.returncode == 0 else None
 
 
 def do_main_job(
@@ -163,6 +173,8 @@ def do_main_job(
     options = ColorConfig.quick()
     if toy:
         options = replace(options, training=replace(options.training, steps=20))
+    for earlier in ("run", *methods):  # a stage that is finished would be taken for a quick one
+        shutil.rmtree(out / earlier, ignore_errors=True)
     colors = fit_color(scene, out / "run", options)
     seconds = round(time.perf_counter() - start, 1)
     save("colours", {"seconds": seconds, "score": str(score_views(colors, scene)), "Gaussians": len(colors)})

@@ -6,6 +6,7 @@
 #
 # A part that takes too long is stopped; OUT/gpu.json and the table OUT/gpu.md keep what was finished.
 set -uo pipefail
+export PYTHONPATH="$(dirname "$0")/..${PYTHONPATH:+:$PYTHONPATH}"
 out=${1:?the folder for the results}
 shift
 status=0

@@ -107,7 +107,7 @@ def hints_for(name: str, table: Mapping[str, Setting]) -> str:
 def with_values(options: Any, values: Mapping[str, Any], table: Mapping[str, Setting], place: str = "") -> Any:
     """The options with new values by name; each group checks its own."""
     new = {}
-    for name in {full.removeprefix(place).partition(".")[0] for full in values if full.startswith(place)}:
+    for name in dict.fromkeys(full.removeprefix(place).partition(".")[0] for full in values if full.startswith(place)):
         full = place + name
         new[name] = values[full] if full in values else with_values(getattr(options, name), values, table, f"{full}.")
     try:

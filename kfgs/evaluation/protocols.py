@@ -76,8 +76,8 @@ class DF3DGS(KfgsPooled):
 
     name: ClassVar[str] = "df3dgs/1"
     about: ClassVar[str] = (
-        "one confusion matrix over all views after merging (rug to floor), mean IoU of the ten classes with most true pixels "
-        "(ties by name); all classes are asked; accuracy over all pixels"
+        "one confusion matrix over the test views of the paper's split after merging (rug to floor), mean IoU of the ten classes "
+        "with most true pixels (ties by name); all classes are asked; accuracy over all pixels"
     )
     rule: ClassVar[LabelRule] = "paper"
     scene_split: ClassVar[SplitChoice] = "df3dgs"

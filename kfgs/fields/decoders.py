@@ -237,7 +237,7 @@ def divide_votes(cosines: Tensor, known: Tensor) -> Votes:  # [N, C], [N] bool
     A class that no Gaussian prefers gets no vote: it would win pixels where it is second everywhere.
     """
     classes = torch.bincount(largest(cosines)[1][known], minlength=cosines.shape[1]).nonzero()[:, 0]
-    shares = torch.softmax(cosines.index_select(1, classes).mul_(LOGIT_SCALE), dim=1).mul_(known[:, None])
+    shares = torch.softmax(cosines.index_select(1, classes).mul_(LOGIT_SCALE), dim=1) * known[:, None]
     return Votes(classes, torch.nn.functional.threshold(shares, LEAST_SHARE, 0, inplace=True))
 
 

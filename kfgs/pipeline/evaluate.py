@@ -73,8 +73,9 @@ def open_question(
     """
     protocol = get_protocol(protocol) if isinstance(protocol, str) else protocol
     folder, place = as_path(scene), None if truth is None else as_path(truth)
-    rule: Any = "auto" if split is not None else getattr(protocol, "scene_split", "auto")
-    loaded = load_scene(folder, images=images, split=rule).undistorted()
+    loaded = load_scene(folder, images=images).undistorted()
+    if split is None and (rule := getattr(protocol, "scene_split", None)) is not None:
+        loaded = replace(loaded, splits=make_split(len(loaded), rule))
     if not isinstance(protocol, TeacherAgreement):
         return Question(protocol, loaded, *protocol.open(loaded, folder, place, split))
     maps = place or folder / "features"
@@ -173,9 +174,8 @@ def _notes(question: Question, method: Any, encode: Any) -> list[str]:
     both = len(trained & scored)
     notes = [f"{both} of {len(views)} scored views were trained on"] if both else []
     split = getattr(question.protocol, "scene_split", None)
-    parts = {} if split is None else make_split(len(scene), split)
     for name, stems, what in (("test", scored, "scored"), ("train", trained, "trained")):
-        own = {scene.stem(i) for i in parts.get(name, ())}
+        own = set() if split is None else {scene.stem(i) for i in make_split(len(scene), split)[name]}
         if own and stems:
             notes.append(f"split {split}: {len(own & stems)} of the {len(stems)} views {what} are its {name} views")
     sizes = sorted({view.camera.size for view in views}, key=lambda size: size[0] * size[1])

@@ -1,4 +1,4 @@
-"""The compiled kernels of one square for many channels: weights first, then a product with the features in blocks.
+"""The compiled kernels of one square for many channels, and of accumulation for any: weights first, then a product in blocks.
 
 The weights of a block's Gaussians are a small matrix [n, 16 pixels], its sums weights^T features [16, D], and what the
 backward pass needs are features grads^T [n, 16] and weights grads [n, D]. Each product is cut into pieces whose sums fill
