@@ -11,8 +11,9 @@ OUT/gpu.json has all numbers and OUT/gpu.md a table, those of earlier calls with
 loses only what it was about. The job is timed alone: run the parts one after the other.
 
 TOY is the room of `kfgs demo` (`DEMO/scene`). It is made if it is not given, which needs pycolmap. To carry less, leave out its
-folder `features`: they are made again, the same. `CUDA_VISIBLE_DEVICES="" ... --parts job` gives the CPU's numbers for the same
-room. Without a GPU, `TRITON_INTERPRET=1 bash benchmarks/gpu.sh OUT --toy` tries the script itself; its numbers mean nothing.
+folder `features`: they are made again, the same. `CUDA_VISIBLE_DEVICES="" ... --parts job` with another OUT gives the CPU's
+numbers for the same room. Without a GPU, `TRITON_INTERPRET=1 bash benchmarks/gpu.sh OUT --toy` tries the script itself; its
+numbers mean nothing.
 """
 
 from __future__ import annotations
@@ -82,7 +83,10 @@ def main() -> None:
     name = (torch.cuda.get_device_name() if device == "cuda" else "cpu") + (", toy sizes" if args.toy else "")
     file = args.out / "gpu.json"
     report: dict[str, Any] = dict(read_json(file)) if file.exists() else {}
-    report = report if report.get("device") == name else {"device": name}  # never two devices in one table
+    if report.setdefault("device", name) != name:
+        parser.error(
+            f"--out: expected results of {name}, or none, got those of {report['device']}; give another folder"
+        )
 
     def save(part: str, facts: Any) -> None:
         report[part] = facts
@@ -169,12 +173,12 @@ def do_main_job(
 ) -> None:
     """Seconds and scores of colours and of a field by each method, and how many labels of a view are equal on the CPU."""
     scene, maps = load_scene(folder), FeatureFolder(make_features(folder))
-    truth, start = true_labels(scene, folder / "labels", "test"), time.perf_counter()
-    options = ColorConfig.quick()
+    truth, options = true_labels(scene, folder / "labels", "test"), ColorConfig.quick()
     if toy:
         options = replace(options, training=replace(options.training, steps=20))
     for earlier in ("run", *methods):  # a stage that is finished would be taken for a quick one
         shutil.rmtree(out / earlier, ignore_errors=True)
+    start = time.perf_counter()
     colors = fit_color(scene, out / "run", options)
     seconds = round(time.perf_counter() - start, 1)
     save("colours", {"seconds": seconds, "score": str(score_views(colors, scene)), "Gaussians": len(colors)})

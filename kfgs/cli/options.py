@@ -52,7 +52,7 @@ class Settings:
             color = getattr(options, "color", options)
             color = replace(color, training=color.training.with_steps(self.steps))
             options = color if hasattr(options, "training") else replace(options, color=color)
-        table = settings_of(options)
+        table = settings_of(options) if self.set else {}
         if "help" in self.set:
             say(f"Options of {chosen} and their values for --set; none leaves a whole group out:")
             lines = [f"{name}={written}  {text}" for name, (_, written, text) in table.items()]
