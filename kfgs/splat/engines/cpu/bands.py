@@ -6,8 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from . import narrow as narrow
-from . import wide as wide
+from . import narrow, wide
 from .cache import cached_njit, inner_njit
 from .simd import (
     LANES,
@@ -35,6 +34,7 @@ from .square import (
     aligned,
     find_place,
     make_square,
+    squares_of,
     start_square,
 )
 
@@ -109,7 +109,7 @@ def composite_band(
     if source is not None:
         sums, kept = aligned(PIXELS * stride, rows.values), wide.make_kept(rows.values)
         streams = channels == stride and maps.ctypes.data % 64 == 0  # a pixel's row is whole cache lines
-    for number in range(view.bounds[band] * view.across**2, view.bounds[band + 1] * view.across**2):
+    for number in squares_of(view, band):
         place = find_place(view, number)
         dark = start_square(square, place.box)
         span = place.start, place.end, place.trace
@@ -166,7 +166,7 @@ def accumulate_band(
     values[:] = 0
     own = out[firsts[band] * width : firsts[band + 1] * width]
     own[:] = 0
-    for number in range(view.bounds[band] * view.across**2, view.bounds[band + 1] * view.across**2):
+    for number in squares_of(view, band):
         place = find_place(view, number)
         if place.start == place.end:
             continue

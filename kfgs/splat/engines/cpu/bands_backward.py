@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from . import narrow as narrow
-from . import wide as wide
+from . import narrow, wide
 from .bands import SIXTEEN, Picture, Trace, read_block
 from .cache import cached_njit, inner_njit
 from .simd import LANES, add_dot, load, load_many, spread, spread_many, store, store_many, transpose
@@ -19,6 +18,7 @@ from .square import (
     aligned,
     find_place,
     make_square,
+    squares_of,
     start_square,
 )
 
@@ -102,7 +102,7 @@ def differentiate_band(
         slopes, kept = aligned((CHUNK + 3) * LANES, rows.values), wide.make_kept(rows.values)
     own = out[firsts[band] * row : firsts[band + 1] * row]
     own[:] = 0
-    for number in range(view.bounds[band] * view.across**2, view.bounds[band + 1] * view.across**2):
+    for number in squares_of(view, band):
         place = find_place(view, number)
         seen = trace.seen[number]
         if seen == 0:

@@ -32,6 +32,7 @@ from .square import (
     aligned,
     find_place,
     make_square,
+    squares_of,
     start_square,
 )
 
@@ -154,7 +155,7 @@ def rank_band(
     if source is not None:
         sums, planes = aligned(PIXELS * stride, rows.values), aligned(stride * LANES, rows.values)
         kept = wide.make_kept(rows.values)
-    for number in range(view.bounds[band] * view.across**2, view.bounds[band + 1] * view.across**2):
+    for number in squares_of(view, band):
         place = find_place(view, number)
         dark = start_square(square, place.box)
         span, count, names = (place.start, place.end, place.start), channels, every

@@ -160,8 +160,14 @@ class Place(NamedTuple):
 
 
 @inner_njit()
+def squares_of(view: View, band: int) -> Any:
+    """The numbers of the squares of a band's tiles, front to back. Not a generator: numba frees nothing that one is given."""
+    return range(view.bounds[band] * view.across**2, view.bounds[band + 1] * view.across**2)
+
+
+@inner_njit()
 def find_place(view: View, number: int) -> Place:
-    """Where a square lies; beyond a border it has neither pixels nor Gaussians. Numba frees nothing that a generator is given."""
+    """Where a square lies; beyond a border it has neither pixels nor Gaussians."""
     tile, square = number // view.across**2, number % view.across**2
     columns = (view.width + view.tile_size - 1) // view.tile_size
     start, end = view.offsets[tile], view.offsets[tile + 1]
